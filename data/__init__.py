@@ -1,0 +1,1 @@
+"""Build the image-instruction-action dataset: `python -m data`."""

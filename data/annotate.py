@@ -1,0 +1,83 @@
+"""The label of a sample: a matrix inside the style's range, shifted by what adds risk or taste.
+
+position 0 is the conservative end of the style's [lower, upper], 1 the aggressive end. A clear
+scene draws near 0.65; rain, fog, snow and night shift towards 0; remembered feedback shifts
+against the complaint. The label always keeps K_i <= K_p^2 / 8.
+"""
+
+import numpy as np
+
+from .instructions import FeedbackKind
+from ridetune.alignment import CONSERVATIVE_SIGN
+from ridetune.codec import MatrixCodec
+from ridetune.matrix import ControllerMatrix, Style, ki_limit
+from ridetune.sample import Condition
+
+CLEAR_POSITION = 0.65
+CONDITION_SHIFT: dict[Condition, float] = {
+    "sunny": 0.0,
+    "rain": -0.30,
+    "fog": -0.35,
+    "snow": -0.40,
+    "night": -0.25,
+}
+FEEDBACK_SHIFT: dict[FeedbackKind, float] = {
+    "too_aggressive": -0.30,
+    "just_right": 0.0,
+    "too_conservative": +0.30,
+}
+COMMON_SPREAD = 0.06  # one draw for all parameters: people differ
+OWN_SPREAD = 0.05  # one draw for each parameter
+# W_h carries no style: drawn around this share of its lower..upper.
+HEADING_POSITION = 0.4
+
+_MANNER: dict[Style, str] = {
+    "aggressive": "i react faster and follow more closely",
+    "moderate": "i keep the usual balance",
+    "conservative": "i drive more gently and leave more room",
+}
+_CARE: dict[Condition, str] = {
+    "sunny": "",
+    "rain": ", a little softer on the wet road",
+    "fog": ", with extra care in the fog",
+    "snow": ", with much softer inputs on the snow",
+    "night": ", more carefully in the dark",
+}
+_TASTE: dict[FeedbackKind, str] = {
+    "too_aggressive": ", calmer than last time",
+    "just_right": ", as you liked it last time",
+    "too_conservative": ", brisker than last time",
+}
+
+
+def draw_matrix(
+    style: Style,
+    condition: Condition,
+    feedback: FeedbackKind | None,
+    codec: MatrixCodec,
+    rng: np.random.Generator,
+) -> ControllerMatrix:
+    """A labelled matrix inside [lower, upper] of the style."""
+    position = CLEAR_POSITION + CONDITION_SHIFT[condition] + rng.normal(0, COMMON_SPREAD)
+    if feedback is not None:
+        position += FEEDBACK_SHIFT[feedback]
+    values = []
+    for i, limits in enumerate(codec.ranges.styles[style]):
+        place = (HEADING_POSITION if CONSERVATIVE_SIGN[i] == 0 else position) + rng.normal(
+            0, OWN_SPREAD
+        )
+        place = float(np.clip(place, 0.02, 0.98))
+        if CONSERVATIVE_SIGN[i] > 0:
+            place = 1.0 - place
+        low, high = codec.share(limits.lower, i), codec.share(limits.upper, i)
+        values.append(codec.value(low + place * (high - low), i))
+    values[1] = min(values[1], ki_limit(values[0]))
+    return ControllerMatrix.of(values)
+
+
+def explain(
+    style: Style, reason: str, condition: Condition, feedback: FeedbackKind | None
+) -> str:
+    """One sentence that says why, in lower case: reason, manner, care, taste."""
+    taste = _TASTE[feedback] if feedback is not None else ""
+    return f"because {reason}, {_MANNER[style]}{_CARE[condition]}{taste}."

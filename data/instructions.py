@@ -1,0 +1,228 @@
+"""The instruction bank: what passengers say, in three styles and three directness levels.
+
+In: data/bank/*.yaml, written out by hand: sentences, templates with slots, a phrase grammar,
+feedback phrases and reasons. Out: drawn instructions. Whole sentences and whole templates are held
+out for testing; a held-out sentence that nearly repeats a training sentence goes to training.
+"""
+
+import hashlib
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ridetune.matrix import STYLES, Style
+from ridetune.sample import LEVELS, Level, Split
+
+BANK = Path(__file__).parent / "bank"
+HELD_OUT_SENTENCES = 0.15
+HELD_OUT_TEMPLATES = 0.25
+HELD_OUT_FEEDBACK = 0.2
+NEAR_REPEAT = 0.7  # Jaccard similarity of the word sets
+
+T = TypeVar("T")
+
+FeedbackKind = Literal["too_aggressive", "too_conservative", "just_right"]
+FEEDBACK_KINDS: tuple[FeedbackKind, ...] = ("too_aggressive", "too_conservative", "just_right")
+
+OPENERS = ("Um, ", "Hey car, ", "Listen, ", "Well, ", "So, ", "Okay, ")
+CLOSERS = (", please.", ", thanks.", ", okay?", " now.")
+
+_SLOT = re.compile(r"\{(\w+)\}")
+_SYMBOL = re.compile(r"\$(\w+)")
+# The grammar does not know intents; these say roughly what its sentences are about.
+_GRAMMAR_INTENT: dict[Style, tuple[str, str]] = {
+    "aggressive": ("speed", "urgency"),
+    "moderate": ("speed", "status_quo"),
+    "conservative": ("speed", "comfort"),
+}
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """One sentence, or a template whose {slots} are still open."""
+
+    text: str
+    style: Style
+    level: Level
+    intent: str
+    phrase_id: str
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class Bank:
+    """All phrases with the material that fills and varies them."""
+
+    phrases: tuple[Phrase, ...]
+    slots: dict[str, list[str]]
+    grammar: dict[str, list[str]]
+    feedback: dict[FeedbackKind, list[str]]
+    reasons: dict[str, dict[Style, str]]
+
+    @cached_property
+    def _by_style(self) -> dict[tuple[Style, bool], tuple[Phrase, ...]]:
+        return {
+            (style, held_out): tuple(
+                p for p in self.phrases if p.style == style and p.held_out == held_out
+            )
+            for style in STYLES
+            for held_out in (False, True)
+        }
+
+    def choose(self, style: Style, split: Split) -> tuple[Phrase, ...]:
+        """The phrases of a style that a split may use."""
+        return self._by_style[style, split == "test"]
+
+    def fill(self, phrase: Phrase, rng: np.random.Generator) -> str:
+        """The phrase with its slots filled."""
+        return _SLOT.sub(lambda slot: pick(self.slots[slot[1]], rng), phrase.text)
+
+    def grow(self, style: Style, level: Level, rng: np.random.Generator) -> str:
+        """A sentence from the phrase grammar."""
+        grown = f"${style}_{level}"
+        while _SYMBOL.search(grown):
+            grown = _SYMBOL.sub(lambda s: pick(self.grammar[s[1]], rng), grown)
+        return _tidy(grown)
+
+    def grown_phrase(self, style: Style, rng: np.random.Generator) -> Phrase:
+        """A training phrase from the grammar."""
+        level = LEVELS[int(rng.integers(len(LEVELS)))]
+        intent = _GRAMMAR_INTENT[style][level == "III"]
+        text = self.grow(style, level, rng)
+        return Phrase(text, style, level, intent, f"grammar/{style}/{level}", held_out=False)
+
+    @cached_property
+    def _feedback(self) -> dict[tuple[FeedbackKind, bool], list[str]]:
+        return {
+            (kind, held_out): [
+                t for t in texts if (_share(t) < HELD_OUT_FEEDBACK) == held_out
+            ]
+            for kind, texts in self.feedback.items()
+            for held_out in (False, True)
+        }
+
+    def feedback_of(self, kind: FeedbackKind, split: Split) -> list[str]:
+        """Feedback sentences of one kind that a split may use."""
+        return self._feedback[kind, split == "test"]
+
+
+def load_bank(folder: Path = BANK) -> Bank:
+    """Read and check the whole bank; ValueError names the file and the wrong entry."""
+    slots: dict[str, list[str]] = _read(folder / "slots.yaml")
+    grammar: dict[str, list[str]] = _read(folder / "grammar.yaml")
+    _check_grammar(grammar)
+    phrases: dict[str, Phrase] = {}
+    for path in sorted(folder.glob("*_*.yaml")):
+        for phrase in _phrases_of(path, slots):
+            phrases.setdefault(_normal(phrase.text), phrase)
+    if not phrases:
+        raise ValueError(f"no sentences in {folder}; expected files such as moderate_families.yaml")
+    return Bank(
+        phrases=_keep_apart(phrases.values()),
+        slots=slots,
+        grammar=grammar,
+        feedback=_read(folder / "feedback.yaml"),
+        reasons=_read(folder / "reasons.yaml"),
+    )
+
+
+def pick(options: Sequence[T], rng: np.random.Generator) -> T:
+    """One of the options, uniformly."""
+    return options[int(rng.integers(len(options)))]
+
+
+def vary(text: str, rng: np.random.Generator) -> str:
+    """The sentence as speech recognition might hand it over: case, punctuation, filler words."""
+    if rng.random() < 0.15:
+        text = pick(OPENERS, rng) + text[0].lower() + text[1:]
+    if rng.random() < 0.1:
+        text = text.rstrip(".!?") + pick(CLOSERS, rng)
+    if rng.random() < 0.3:
+        text = text.rstrip(".!?")
+    if rng.random() < 0.1:
+        text = re.sub(r"[,;:]", "", text)
+    return text
+
+
+def _phrases_of(path: Path, slots: dict[str, list[str]]) -> Iterable[Phrase]:
+    raw = _read(path)
+    style = raw["style"]
+    if style not in STYLES:
+        raise ValueError(f"{path}: style {style!r} is none of {', '.join(STYLES)}")
+    for level in LEVELS:
+        for intent, texts in raw["sentences"][level].items():
+            for text in texts:
+                held_out = _share(text) < HELD_OUT_SENTENCES
+                name = f"{path.stem}/{level}/{_digest(text)[:8]}"
+                yield Phrase(text, style, level, intent, name, held_out)
+        for template in raw["templates"][level]:
+            text = template["text"]
+            unknown = set(_SLOT.findall(text)) - set(slots)
+            if unknown:
+                raise ValueError(f"{path}: {text!r} uses the slot {unknown.pop()!r}, see slots.yaml")
+            held_out = _share(text) < HELD_OUT_TEMPLATES
+            name = f"{path.stem}/{level}/template-{_digest(text)[:8]}"
+            yield Phrase(text, style, level, template["intent"], name, held_out)
+
+
+def _keep_apart(phrases: Iterable[Phrase]) -> tuple[Phrase, ...]:
+    """Move held-out phrases that nearly repeat a training phrase over to training."""
+    kept = sorted(phrases, key=lambda p: p.phrase_id)
+    words = _word_matrix([p.text for p in kept])  # [phrase, word] of 0 and 1
+    held_out = np.array([p.held_out for p in kept])
+    shared = words[held_out] @ words[~held_out].T  # [held out, training]
+    sizes = words.sum(axis=1)
+    either = sizes[held_out][:, None] + sizes[~held_out][None, :] - shared
+    repeats = np.zeros(len(kept), bool)
+    repeats[held_out] = (shared >= NEAR_REPEAT * either).any(axis=1)
+    return tuple(replace(p, held_out=p.held_out and not r) for p, r in zip(kept, repeats, strict=True))
+
+
+def _word_matrix(texts: list[str]) -> NDArray[np.float32]:
+    words = [set(_normal(text).split()) for text in texts]
+    column = {word: i for i, word in enumerate(sorted(set().union(*words)))}
+    matrix = np.zeros((len(texts), len(column)), np.float32)
+    for row, own in enumerate(words):
+        matrix[row, [column[word] for word in own]] = 1
+    return matrix
+
+
+def _check_grammar(grammar: dict[str, list[str]]) -> None:
+    for style in STYLES:
+        for level in LEVELS:
+            if f"{style}_{level}" not in grammar:
+                raise ValueError(f"grammar.yaml lacks the root {style}_{level}")
+    for symbol, expansions in grammar.items():
+        for name in {n for text in expansions for n in _SYMBOL.findall(text)} - set(grammar):
+            raise ValueError(f"grammar.yaml: {symbol} uses ${name}, which is not defined")
+
+
+def _read(path: Path) -> Any:
+    if not path.is_file():
+        raise ValueError(f"the instruction bank lacks {path.name} in {path.parent}")
+    return yaml.safe_load(path.read_text())
+
+
+def _tidy(text: str) -> str:
+    text = re.sub(r"\s+([,.!?])", r"\1", " ".join(text.split()))
+    return text[:1].upper() + text[1:]
+
+
+def _normal(text: str) -> str:
+    return " ".join(re.findall(r"[a-z']+", text.lower()))
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(_normal(text).encode(), digest_size=8).hexdigest()
+
+
+def _share(text: str) -> float:
+    """A number in [0, 1) that depends on the wording alone."""
+    return int(_digest(text), 16) / 2**64

@@ -1,0 +1,66 @@
+"""YAML + overrides -> a frozen dataclass; unknown keys are errors that name the nearest one."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+Config = TypeVar("Config")
+
+
+def load_config(kind: type[Config], path: Path, overrides: Sequence[str] = ()) -> Config:
+    """Read a YAML file into the dataclass `kind` and apply `section.key=value` overrides.
+
+    Raises ValueError with the file, the key and the remedy.
+    """
+    if not path.is_file():
+        raise ValueError(f"no config file at {path}; the shipped ones are in configs/")
+    try:
+        raw = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not valid YAML: {error}") from error
+    if not isinstance(raw, dict):
+        raise ValueError(f"{path} must hold a mapping of keys to values")
+    for override in overrides:
+        _override(raw, override)
+    _check_keys(kind, raw, str(path))
+    try:
+        return TypeAdapter(kind).validate_python(raw)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"{path}: {key}: {first['msg']}, got {first['input']!r}") from error
+
+
+def save_config(config: Any, path: Path) -> None:
+    """Write the resolved config beside the artefact it made."""
+    plain = TypeAdapter(type(config)).dump_python(config, mode="json")
+    path.write_text(yaml.safe_dump(plain, sort_keys=False))
+
+
+def _override(raw: dict[str, Any], override: str) -> None:
+    key, equals, value = override.partition("=")
+    if not equals:
+        raise ValueError(f"override {override!r} is not of the form section.key=value")
+    *sections, last = key.split(".")
+    for section in sections:
+        inner = raw.setdefault(section, {})
+        if not isinstance(inner, dict):
+            raise ValueError(f"override {override!r}: {section} is a value, not a section")
+        raw = inner
+    raw[last] = yaml.safe_load(value)
+
+
+def _check_keys(kind: Any, raw: Mapping[str, Any], where: str) -> None:
+    known = [field.name for field in fields(kind)]
+    types = get_type_hints(kind)
+    for key, value in raw.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)
+            raise ValueError(f"{where}: unknown key {key!r}; did you mean {near[0]!r}?")
+        if is_dataclass(types[key]) and isinstance(value, Mapping):
+            _check_keys(types[key], value, f"{where}: {key}")

@@ -1,0 +1,135 @@
+"""What the car saw, what the passenger said, and what the right answer is.
+
+An Observation and an instruction go in; a Sample adds the label and the targets that training
+needs. A row is a Sample as the dataset file holds it: plain values, the frame as encoded bytes.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from ridetune.matrix import NUM_PARAMETERS, ControllerMatrix, Style
+
+Condition = Literal["sunny", "rain", "fog", "snow", "night"]
+CONDITIONS: tuple[Condition, ...] = get_args(Condition)
+ADVERSE: tuple[Condition, ...] = ("rain", "fog", "snow", "night")
+
+Level = Literal["I", "II", "III"]
+LEVELS: tuple[Level, ...] = get_args(Level)
+
+Split = Literal["train", "calibration", "test"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One camera frame as encoded JPEG or PNG bytes."""
+
+    frame: bytes
+
+
+@dataclass(frozen=True)
+class Memory:
+    """One remembered drive (I, C, P, F): what was said, the scene, the matrix, the feedback."""
+
+    instruction: str
+    scene: str
+    matrix: ControllerMatrix
+    feedback: str
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One image-instruction-action pair with its provenance.
+
+    scene_id names the scene without its condition: the five frames of one scene share it.
+    phrase_id names the sentence or template that the instruction comes from.
+    """
+
+    observation: Observation
+    instruction: str
+    memories: tuple[Memory, ...]
+    matrix: ControllerMatrix
+    scene: str
+    explanation: str
+    style: Style
+    level: Level
+    intent: str
+    condition: Condition
+    split: Split
+    scene_id: str
+    phrase_id: str
+
+    def as_row(self) -> dict[str, Any]:
+        """The row of the dataset file; `Sample.of_row` is its inverse."""
+        return {
+            "image": {"bytes": self.observation.frame, "path": None},
+            "instruction": self.instruction,
+            "memories": [
+                {
+                    "instruction": m.instruction,
+                    "scene": m.scene,
+                    "matrix": list(m.matrix.values),
+                    "feedback": m.feedback,
+                }
+                for m in self.memories
+            ],
+            "matrix": list(self.matrix.values),
+            "scene": self.scene,
+            "explanation": self.explanation,
+            "style": self.style,
+            "level": self.level,
+            "intent": self.intent,
+            "condition": self.condition,
+            "split": self.split,
+            "scene_id": self.scene_id,
+            "phrase_id": self.phrase_id,
+        }
+
+    @staticmethod
+    def of_row(row: dict[str, Any]) -> "Sample":
+        """Read a row with its image undecoded (`datasets.Image(decode=False)`)."""
+        frame = row["image"]["bytes"]
+        if not frame:
+            raise ValueError(f"row of scene {row['scene_id']}: the image has no bytes")
+        memories = tuple(
+            Memory(m["instruction"], m["scene"], ControllerMatrix.of(m["matrix"]), m["feedback"])
+            for m in row["memories"]
+        )
+        kept = {name: row[name] for name in _PLAIN_FIELDS}
+        return Sample(
+            observation=Observation(frame),
+            memories=memories,
+            matrix=ControllerMatrix.of(row["matrix"]),
+            **kept,
+        )
+
+
+_PLAIN_FIELDS = (
+    "instruction",
+    "scene",
+    "explanation",
+    "style",
+    "level",
+    "intent",
+    "condition",
+    "split",
+    "scene_id",
+    "phrase_id",
+)
+
+
+def dataset_features() -> Any:
+    """The `datasets.Features` of a row; the frame stays encoded."""
+    from datasets import Features, Image, Value
+    from datasets import Sequence as Series
+
+    matrix = Series(Value("float32"), length=NUM_PARAMETERS)
+    text = Value("string")
+    memory = {"instruction": text, "scene": text, "matrix": matrix, "feedback": text}
+    return Features(
+        {
+            "image": Image(decode=False),
+            "memories": [memory],
+            "matrix": matrix,
+            **{name: text for name in _PLAIN_FIELDS},
+        }
+    )

@@ -1,0 +1,1 @@
+"""LoRA fine-tuning and the tiny base: `python -m train`, `python -m train.tiny`."""

@@ -1,0 +1,73 @@
+"""The training loss: ordinal cross-entropy on the six bins, cross-entropy on the text.
+
+A label is one draw from a range, so its neighbours are nearly as right: the target is a Gaussian
+over the bins around the label, in the sense of soft ordinal labels (Diaz & Marathe, 2019).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ridetune.codec import NUM_BINS
+from ridetune.prompt import TokenIds
+from ridetune.qwen import action_logits, encode_frames, run_tokens
+from ridetune.vision import VisionSpec
+
+from .collate import Batch
+
+BIN_SPREAD = 6.0  # standard deviation of the soft target, in bins
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Mean losses of one batch; `total` is what is minimised."""
+
+    actions: Tensor
+    text: Tensor
+    total: Tensor
+
+
+def batch_loss(
+    model: Any,
+    batch: Batch,
+    spec: VisionSpec,
+    token_ids: TokenIds,
+    *,
+    text_weight: float,
+    frozen_vision: bool = False,
+) -> tuple[Loss, Tensor]:
+    """One forward pass: the losses and the last hidden states [sample, token, hidden]."""
+    features = None
+    if batch.patches is not None:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen_vision):
+            features = encode_frames(model, batch.patches, spec)
+    hidden = run_tokens(model, batch.ids, batch.positions, features, token_ids)
+    actions = _action_loss(model, batch, hidden, token_ids)
+    text = _text_loss(model, batch, hidden)
+    return Loss(actions, text, actions + text_weight * text), hidden
+
+
+def _action_loss(model: Any, batch: Batch, hidden: Tensor, token_ids: TokenIds) -> Tensor:
+    if len(batch.query_rows) == 0:
+        return hidden.new_zeros(())
+    at_queries = hidden[batch.query_rows[:, None], batch.queries]  # [n, 6, hidden]
+    logits = action_logits(model, at_queries, token_ids).float()
+    return F.cross_entropy(logits.flatten(0, 1), soft_bins(batch.bins).flatten(0, 1))
+
+
+def _text_loss(model: Any, batch: Batch, hidden: Tensor) -> Tensor:
+    if len(batch.text_rows) == 0:
+        return hidden.new_zeros(())
+    before = hidden[batch.text_rows, batch.text_at]  # [targets, hidden]
+    logits = model.get_output_embeddings()(before).float()
+    return F.cross_entropy(logits, batch.text_ids)
+
+
+def soft_bins(bins: Tensor) -> Tensor:
+    """Labels [..., 6] -> target distributions [..., 6, 256]."""
+    levels = torch.arange(NUM_BINS, device=bins.device)
+    distance = (levels - bins[..., None]) / BIN_SPREAD
+    return torch.softmax(-0.5 * distance.square(), dim=-1)
