@@ -1,0 +1,96 @@
+# ridetune from a clean checkout: `make demo` builds whatever is missing on the way.
+# Each stage is one file rule, so a second run redoes only what changed.
+
+PYTHON ?= python3
+VENV = .venv
+RUN = runs/tiny
+BASE = models/tiny
+FRAMES =
+PORT = 8077
+
+PY = $(VENV)/bin/python
+INSTALLED = $(VENV)/.installed
+LIBRARY = $(wildcard ridetune/*.py ridetune/*/*.py)
+EXPORT = $(addprefix quantize/,export.py graphs.py onnx_files.py operators.py parity.py)
+CONTRACT = $(addprefix ridetune/,alignment.py codec.py config.py matrix.py sample.py stage.py)
+
+# Every model is a folder on this disk; nothing is looked up elsewhere.
+export HF_HUB_OFFLINE = 1
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help venv data train quantize bench serve demo test lint types clean
+
+help:  ## Print this list
+	@grep -E '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/^([a-z]+):[^#]*## /\1|/' \
+		| awk -F '|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
+
+venv: $(INSTALLED)  ## Create .venv and install everything (PYTHON=python3.12 picks another)
+data: $(RUN)/data/manifest.json  ## Build the dataset
+train: $(RUN)/merged/manifest.json  ## Fine-tune with LoRA and merge the adapter
+quantize: $(RUN)/bundle/bundle.json  ## Quantize to 4-bit AWQ and export the bundle
+bench: $(RUN)/evaluation.json  ## Profile the bundle's latency and score what it does
+
+serve: $(RUN)/.profiled  ## Serve the bundle and the cockpit page (PORT=8077)
+	$(PY) -m serve --config configs/serve.yaml bundle=$(RUN)/bundle port=$(PORT)
+
+demo: $(RUN)/.profiled  ## Drive a few frames on the terminal (FRAMES=folder of images)
+	$(PY) -m serve.demo --config configs/demo.yaml \
+		bundle=$(RUN)/bundle data=$(RUN)/data $(if $(FRAMES),frames=$(FRAMES))
+
+test: $(INSTALLED)  ## Run the tests
+	$(PY) -m pytest
+
+lint: $(INSTALLED)  ## Check format and style
+	$(PY) -m ruff format --check .
+	$(PY) -m ruff check .
+
+types: $(INSTALLED)  ## Check types
+	$(PY) -m mypy
+
+clean:  ## Delete the run and the tools' caches; .venv and models stay
+	rm -rf $(RUN) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+# torch first and alone: the other packages then settle on this build of it.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and \
+		"ridetune needs Python 3.11 or newer; name one with make PYTHON=python3.12")'
+	test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install -c constraints.txt torch==2.13.0
+	$(PY) -m pip install -c constraints.txt -e ".[all,dev]"
+	@touch $@
+
+$(RUN)/data/manifest.json: $(wildcard data/*.py data/bank/*.yaml) $(CONTRACT) \
+		configs/data.yaml configs/ranges.yaml | $(INSTALLED)
+	$(PY) -m data --config configs/data.yaml out=$(RUN)/data
+
+$(RUN)/merged/manifest.json: $(RUN)/data/manifest.json $(wildcard train/*.py) $(CONTRACT) \
+		ridetune/prompt.py ridetune/vision.py ridetune/contract.py ridetune/qwen.py \
+		configs/train.yaml $(wildcard $(BASE)/*) | $(INSTALLED)
+	$(PY) -m train --config configs/train.yaml \
+		base=$(BASE) data=$(RUN)/data adapter=$(RUN)/adapter out=$(RUN)/merged
+
+$(RUN)/awq/manifest.json: $(RUN)/merged/manifest.json \
+		$(filter-out $(EXPORT) quantize/benchmark.py,$(wildcard quantize/*.py)) \
+		ridetune/awq_checkpoint.py ridetune/gemm.py ridetune/qwen.py \
+		configs/quantize.yaml | $(INSTALLED)
+	$(PY) -m quantize --config configs/quantize.yaml \
+		model=$(RUN)/merged data=$(RUN)/data out=$(RUN)/awq
+
+$(RUN)/bundle/bundle.json: $(RUN)/awq/manifest.json $(EXPORT) \
+		ridetune/bundle.py ridetune/ort_engine.py configs/export.yaml | $(INSTALLED)
+	$(PY) -m quantize.export --config configs/export.yaml \
+		model=$(RUN)/awq data=$(RUN)/data out=$(RUN)/bundle
+
+# The benchmark writes its profile into bundle.json, which makes that file newer than itself:
+# the stamp is touched afterwards, so that neither rule starts the other again.
+$(RUN)/.profiled: $(RUN)/bundle/bundle.json quantize/benchmark.py configs/benchmark.yaml \
+		| $(INSTALLED)
+	$(PY) -m quantize.benchmark --config configs/benchmark.yaml
+	@touch $@
+
+$(RUN)/evaluation.json: $(RUN)/.profiled $(wildcard evaluate/*.py) $(LIBRARY) \
+		configs/evaluate.yaml | $(INSTALLED)
+	$(PY) -m evaluate --config configs/evaluate.yaml bundle=$(RUN)/bundle data=$(RUN)/data \
+		merged=$(RUN)/merged quantized=$(RUN)/awq out=$@
