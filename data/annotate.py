@@ -7,11 +7,12 @@ against the complaint. The label always keeps K_i <= K_p^2 / 8.
 
 import numpy as np
 
-from .instructions import FeedbackKind
 from ridetune.alignment import CONSERVATIVE_SIGN
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import ControllerMatrix, Style, ki_limit
 from ridetune.sample import Condition
+
+from .instructions import FeedbackKind
 
 CLEAR_POSITION = 0.65
 CONDITION_SHIFT: dict[Condition, float] = {
@@ -75,9 +76,7 @@ def draw_matrix(
     return ControllerMatrix.of(values)
 
 
-def explain(
-    style: Style, reason: str, condition: Condition, feedback: FeedbackKind | None
-) -> str:
+def explain(style: Style, reason: str, condition: Condition, feedback: FeedbackKind | None) -> str:
     """One sentence that says why, in lower case: reason, manner, care, taste."""
     taste = _TASTE[feedback] if feedback is not None else ""
     return f"because {reason}, {_MANNER[style]}{_CARE[condition]}{taste}."

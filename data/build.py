@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
@@ -20,12 +20,13 @@ from tqdm import tqdm
 from ridetune.codec import MatrixCodec
 from ridetune.config import save_config
 from ridetune.matrix import STYLES, Ranges, Style
-from ridetune.sample import CONDITIONS, Condition, Memory, Observation, Sample, Split
+from ridetune.sample import CONDITIONS, Memory, Observation, Sample, Split
 from ridetune.stage import Stopwatch, new_folder, write_manifest
 
 from .annotate import draw_matrix, explain
 from .instructions import FEEDBACK_KINDS, Bank, FeedbackKind, Phrase, load_bank, pick, vary
-from .synthetic import Scene, describe, render, sample_scene, with_condition
+from .scene import Scene, describe, sample_scene, with_condition
+from .synthetic import render
 
 JPEG_QUALITY = 88
 _SPLIT_SEED: dict[Split, int] = {"train": 0, "calibration": 1, "test": 2}
@@ -67,8 +68,10 @@ def build(config: DataConfig) -> None:
             split: _write_split(split, config, bank, codec, folder)
             for split in ("train", "calibration", "test")
         }
+        _write_feedback(bank, folder)
         if config.phrases:
             counts["phrases"] = _write_phrases(config, bank, codec, folder)
+            counts["held-out phrases"] = _write_held_out(config, bank, codec, folder)
         save_config(config, folder / "config.yaml")
         facts = {
             "samples": counts,
@@ -96,7 +99,9 @@ def _write_split(
     rng = np.random.default_rng([config.seed, _SPLIT_SEED[split]])
     rows = [
         sample.as_row()
-        for number in tqdm(range(scenes), desc=f"{split} scenes", unit="scene", disable=scenes < 100)
+        for number in tqdm(
+            range(scenes), desc=f"{split} scenes", unit="scene", disable=scenes < 100
+        )
         for sample in _scene_samples(f"{split}-{number:06d}", split, config, bank, codec, rng)
     ]
     if rows:
@@ -199,10 +204,15 @@ def encode(pixels: Any) -> bytes:
     return jpeg.tobytes()
 
 
+def _write_feedback(bank: Bank, folder: Path) -> None:
+    """The feedback sentences that no training row holds, to score what memories do."""
+    held_out = {kind: bank.feedback_of(kind, "test") for kind in FEEDBACK_KINDS}
+    (folder / "feedback-test.json").write_text(json.dumps(held_out, indent=2) + "\n")
+
+
 def _write_phrases(config: DataConfig, bank: Bank, codec: MatrixCodec, folder: Path) -> int:
     """Text-only rows: instruction, memories and the label of a clear scene."""
     rng = np.random.default_rng([config.seed, 3])
-    clear: Condition = "sunny"
     with (folder / "phrases.jsonl").open("w") as file:
         for number in tqdm(range(config.phrases), desc="phrases", unit="row"):
             style = STYLES[number % len(STYLES)]
@@ -213,14 +223,38 @@ def _write_phrases(config: DataConfig, bank: Bank, codec: MatrixCodec, folder: P
             if rng.random() < 0.15:
                 _, more = draw_instruction(style, "train", 0.3, bank, rng)
                 text = f"{text.rstrip('.')}. {more}"
-            scene = replace(sample_scene(rng), condition=clear)
-            sample = _sample(
-                f"phrase-{number:06d}", "train", scene, b"", phrase, text, past, bank, codec, rng
-            )
-            row = sample.as_row()
-            del row["image"]
-            file.write(json.dumps(row) + "\n")
+            _write_text_row(file, number, "train", phrase, text, past, bank, codec, rng)
     return config.phrases
+
+
+def _write_held_out(config: DataConfig, bank: Bank, codec: MatrixCodec, folder: Path) -> int:
+    """Every held-out phrase once, to score the understanding of words alone."""
+    rng = np.random.default_rng([config.seed, 4])
+    phrases = [phrase for style in STYLES for phrase in bank.choose(style, "test")]
+    with (folder / "phrases-test.jsonl").open("w") as file:
+        for number, phrase in enumerate(phrases):
+            text = bank.fill(phrase, rng)
+            past = Remembered((), None)
+            _write_text_row(file, number, "test", phrase, text, past, bank, codec, rng)
+    return len(phrases)
+
+
+def _write_text_row(
+    file: TextIO,
+    number: int,
+    split: Split,
+    phrase: Phrase,
+    text: str,
+    past: Remembered,
+    bank: Bank,
+    codec: MatrixCodec,
+    rng: np.random.Generator,
+) -> None:
+    scene = replace(sample_scene(rng), condition="sunny")
+    name = f"phrase-{split}-{number:06d}"
+    row = _sample(name, split, scene, b"", phrase, text, past, bank, codec, rng).as_row()
+    del row["image"]
+    file.write(json.dumps(row) + "\n")
 
 
 def _shuffled(count: int, rng: np.random.Generator) -> list[int]:

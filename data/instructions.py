@@ -7,6 +7,7 @@ out for testing; a held-out sentence that nearly repeats a training sentence goe
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,6 +35,8 @@ FEEDBACK_KINDS: tuple[FeedbackKind, ...] = ("too_aggressive", "too_conservative"
 OPENERS = ("Um, ", "Hey car, ", "Listen, ", "Well, ", "So, ", "Okay, ")
 CLOSERS = (", please.", ", thanks.", ", okay?", " now.")
 
+# The C reader loads the bank in a second, the Python one in eight.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _SLOT = re.compile(r"\{(\w+)\}")
 _SYMBOL = re.compile(r"\$(\w+)")
 # The grammar does not know intents; these say roughly what its sentences are about.
@@ -92,18 +95,43 @@ class Bank:
         return _tidy(grown)
 
     def grown_phrase(self, style: Style, rng: np.random.Generator) -> Phrase:
-        """A training phrase from the grammar."""
+        """A training phrase from the grammar, drawn anew while it nearly repeats a held-out one."""
         level = LEVELS[int(rng.integers(len(LEVELS)))]
         intent = _GRAMMAR_INTENT[style][level == "III"]
         text = self.grow(style, level, rng)
+        while self.repeats_held_out(text):
+            text = self.grow(style, level, rng)
         return Phrase(text, style, level, intent, f"grammar/{style}/{level}", held_out=False)
+
+    def repeats_held_out(self, text: str) -> bool:
+        """Whether a text says nearly the same words as a held-out phrase."""
+        words = set(_normal(text).split())
+        shared = Counter(at for word in words for at in self._held_out_with.get(word, ()))
+        return any(
+            count >= NEAR_REPEAT * (len(words) + self._held_out_sizes[at] - count)
+            for at, count in shared.items()
+        )
+
+    @cached_property
+    def _held_out_words(self) -> list[set[str]]:
+        return [set(_normal(p.text).split()) for p in self.phrases if p.held_out]
+
+    @cached_property
+    def _held_out_sizes(self) -> list[int]:
+        return [len(words) for words in self._held_out_words]
+
+    @cached_property
+    def _held_out_with(self) -> dict[str, list[int]]:
+        numbers: dict[str, list[int]] = {}
+        for at, words in enumerate(self._held_out_words):
+            for word in words:
+                numbers.setdefault(word, []).append(at)
+        return numbers
 
     @cached_property
     def _feedback(self) -> dict[tuple[FeedbackKind, bool], list[str]]:
         return {
-            (kind, held_out): [
-                t for t in texts if (_share(t) < HELD_OUT_FEEDBACK) == held_out
-            ]
+            (kind, held_out): [t for t in texts if (_share(t) < HELD_OUT_FEEDBACK) == held_out]
             for kind, texts in self.feedback.items()
             for held_out in (False, True)
         }
@@ -166,7 +194,9 @@ def _phrases_of(path: Path, slots: dict[str, list[str]]) -> Iterable[Phrase]:
             text = template["text"]
             unknown = set(_SLOT.findall(text)) - set(slots)
             if unknown:
-                raise ValueError(f"{path}: {text!r} uses the slot {unknown.pop()!r}, see slots.yaml")
+                raise ValueError(
+                    f"{path}: {text!r} uses the slot {unknown.pop()!r}, see slots.yaml"
+                )
             held_out = _share(text) < HELD_OUT_TEMPLATES
             name = f"{path.stem}/{level}/template-{_digest(text)[:8]}"
             yield Phrase(text, style, level, template["intent"], name, held_out)
@@ -176,13 +206,17 @@ def _keep_apart(phrases: Iterable[Phrase]) -> tuple[Phrase, ...]:
     """Move held-out phrases that nearly repeat a training phrase over to training."""
     kept = sorted(phrases, key=lambda p: p.phrase_id)
     words = _word_matrix([p.text for p in kept])  # [phrase, word] of 0 and 1
-    held_out = np.array([p.held_out for p in kept])
-    shared = words[held_out] @ words[~held_out].T  # [held out, training]
     sizes = words.sum(axis=1)
-    either = sizes[held_out][:, None] + sizes[~held_out][None, :] - shared
-    repeats = np.zeros(len(kept), bool)
-    repeats[held_out] = (shared >= NEAR_REPEAT * either).any(axis=1)
-    return tuple(replace(p, held_out=p.held_out and not r) for p, r in zip(kept, repeats, strict=True))
+    held_out = np.array([p.held_out for p in kept])
+    moved = ~held_out  # what the remaining held-out phrases are still to be compared with
+    while moved.any() and held_out.any():
+        shared = words[held_out] @ words[moved].T  # [held out, training]
+        either = sizes[held_out][:, None] + sizes[moved][None, :] - shared
+        repeats = np.zeros(len(kept), bool)
+        repeats[held_out] = (shared >= NEAR_REPEAT * either).any(axis=1)
+        held_out &= ~repeats
+        moved = repeats
+    return tuple(replace(p, held_out=bool(h)) for p, h in zip(kept, held_out, strict=True))
 
 
 def _word_matrix(texts: list[str]) -> NDArray[np.float32]:
@@ -207,7 +241,7 @@ def _check_grammar(grammar: dict[str, list[str]]) -> None:
 def _read(path: Path) -> Any:
     if not path.is_file():
         raise ValueError(f"the instruction bank lacks {path.name} in {path.parent}")
-    return yaml.safe_load(path.read_text())
+    return yaml.load(path.read_text(), Loader=_LOADER)
 
 
 def _tidy(text: str) -> str:

@@ -1,183 +1,21 @@
-"""Weather, light and camera effects of the synthetic front camera.
+"""Weather effects of the synthetic front camera: sky, ground light, glows, rain and snow.
 
-In: a condition, a random stream and an RGB image under construction. Out: an `Atmosphere`
-(light, haze, sky, wetness, snow) for the street drawing in `data.synthetic`, and in-place
-effects: sky, ground light, glows, rain, snow flakes, and the sensor. Noise is drawn once per
-image size and cropped at random, so a frame costs a few milliseconds.
+In: an RGB image under construction, an `Atmosphere`, a random stream. Out: the effects, in place
+where they say so. Noise is drawn once per image size and cropped at random, so a frame costs a
+few milliseconds.
 
     PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
-from math import exp
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ridetune.sample import Condition
+from .atmosphere import Atmosphere, Colour
 
-Colour = tuple[float, float, float]  # RGB, 0..255 for colours, about 0..1 for light
 Image = NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class Atmosphere:
-    """Light and air of one frame; distances in metres, x to the right, z forward."""
-
-    condition: Condition
-    light: Colour = (1.0, 1.0, 1.0)  # factor on every albedo
-    sky_top: Colour = (90.0, 140.0, 195.0)
-    sky_low: Colour = (175.0, 195.0, 215.0)
-    cloud: float = 0.0  # opacity of the clouds, 0..1
-    haze: Colour = (180.0, 190.0, 205.0)  # colour of infinitely distant things
-    extinction: float = 0.001  # Koschmieder: transmission exp(-extinction * z), 1/m
-    shadow: float = 0.0  # darkness of cast shadows, 0..1
-    sun: tuple[float, float] = (0.0, 0.0)  # shadow (right, forward) in m per m of height
-    glare: float = 0.0  # strength of the sun in the picture
-    headlamp: float = 0.0  # own headlamps at 0 m, in units of light
-    lamps: float = 0.0  # brightness of all vehicle and street lamps, 0..1
-    glow: float = 0.0  # size of halos round lamps
-    wet: float = 0.0
-    snow: float = 0.0  # cover of the road; verges are covered whenever positive
-    fall: float = 0.0  # density of rain streaks or flakes, 0..1
-    drops: float = 0.0  # drops on the windscreen, 0..1
-
-    def beam(self, x: float, z: float) -> float:
-        """Own headlamp light at ground point (x, z)."""
-        if self.headlamp == 0.0:
-            return 0.0
-        return self.headlamp * exp(-z / 24.0 - (x / (2.2 + 0.2 * z)) ** 2)
-
-    def shade(self, colour: Colour, x: float, z: float) -> Colour:
-        """Colour 0..255 of a surface at (x, z) as the camera sees it: light, then haze."""
-        t, e = exp(-self.extinction * z), self.beam(x, z)
-        return (
-            min(255.0, colour[0] * (self.light[0] + e)) * t + self.haze[0] * (1 - t),
-            min(255.0, colour[1] * (self.light[1] + e)) * t + self.haze[1] * (1 - t),
-            min(255.0, colour[2] * (self.light[2] + 0.9 * e)) * t + self.haze[2] * (1 - t),
-        )
-
-
-def _grey(level: float, tint: float) -> Colour:
-    """Grey of about `level`; a positive tint is bluish, a negative one warm."""
-    return (level * (1 - tint), level, level * (1 + tint))
-
-
-def draw_atmosphere(condition: Condition, rng: np.random.Generator) -> Atmosphere:
-    """Random severity of one condition; `rng` must be the weather stream of the scene."""
-    draw = {"sunny": _sunny, "rain": _rain, "fog": _fog, "snow": _snow, "night": _night}
-    return draw[condition](rng)
-
-
-def _sunny(rng: np.random.Generator) -> Atmosphere:
-    u = rng.random(10)
-    blue, low_sun = u[0], u[1] < 0.25
-    level = 0.85 + 0.5 * u[2]
-    top = (40 + 75 * blue, 70 + 90 * blue, 105 + 105 * blue)
-    pale = 0.35 + 0.5 * u[3]
-    low: Colour = (
-        top[0] + (225 - top[0]) * pale,
-        top[1] + (228 - top[1]) * pale,
-        top[2] + (230 - top[2]) * pale,
-    )
-    warm = 0.12 * u[4] if low_sun else 0.04 * u[4]
-    length = 1.5 + 2.0 * u[5] if low_sun else 0.3 + 0.9 * u[5]
-    angle = 2 * np.pi * u[6]
-    return Atmosphere(
-        "sunny",
-        light=(level * (1 + warm), level, level * (1 - warm)),
-        sky_top=top,
-        sky_low=low,
-        cloud=max(0.0, 1.6 * u[7] - 0.6),
-        haze=low,
-        extinction=0.0006 + 0.002 * u[8] ** 2,
-        shadow=0.35 + 0.35 * u[9],
-        sun=(float(length * np.cos(angle)), float(length * np.sin(angle))),
-        glare=1.0 if (low_sun and np.sin(angle) < 0) or u[4] > 0.9 else 0.0,
-    )
-
-
-def _rain(rng: np.random.Generator) -> Atmosphere:
-    u = rng.random(8)
-    level, tint = 100 + 90 * u[0], 0.07 * u[1] - 0.02
-    light = 0.42 + 0.42 * u[0]
-    low = _grey(level * (0.95 + 0.2 * u[2]), tint)
-    return Atmosphere(
-        "rain",
-        light=(light * (1 - tint), light, light * (1 + tint)),
-        sky_top=_grey(level * (0.7 + 0.3 * u[2]), tint),
-        sky_low=low,
-        cloud=0.25 * u[3],
-        haze=low,
-        extinction=0.004 + 0.012 * u[4],
-        lamps=0.9,
-        glow=0.6,
-        wet=0.5 + 0.5 * u[5],
-        fall=0.25 + 0.75 * u[6],
-        drops=max(0.0, 1.5 * u[7] - 0.5),
-    )
-
-
-def _fog(rng: np.random.Generator) -> Atmosphere:
-    u = rng.random(5)
-    level, tint = 125 + 95 * u[0], 0.06 * u[1] - 0.02
-    light = 0.4 + 0.4 * u[0]
-    haze = _grey(level, tint)
-    return Atmosphere(
-        "fog",
-        light=(light, light, light),
-        sky_top=_grey(level * (0.88 + 0.14 * u[2]), tint),
-        sky_low=haze,
-        haze=haze,
-        extinction=0.018 + 0.075 * u[3] ** 1.5,
-        lamps=0.75,
-        glow=0.8,
-        wet=0.25 * u[4],
-    )
-
-
-def _snow(rng: np.random.Generator) -> Atmosphere:
-    u = rng.random(6)
-    level, tint = 125 + 85 * u[0], 0.14 * u[1] - 0.01
-    light = 0.5 + 0.35 * u[0]
-    low = _grey(level * 1.06, tint)
-    return Atmosphere(
-        "snow",
-        light=(light * (1 - tint), light, light * (1 + tint)),
-        sky_top=_grey(level * (0.8 + 0.2 * u[2]), tint),
-        sky_low=low,
-        cloud=0.2 * u[2],
-        haze=low,
-        extinction=0.004 + 0.014 * u[3],
-        lamps=0.6,
-        glow=0.4,
-        snow=0.25 + 0.75 * u[4],
-        fall=0.2 + 0.8 * u[5],
-    )
-
-
-def _night(rng: np.random.Generator) -> Atmosphere:
-    u = rng.random(6)
-    dusk = u[0] < 0.15
-    level = 60 + 60 * u[1] if dusk else 3 + 22 * u[1] ** 2
-    light = 0.12 + 0.15 * u[1] if dusk else 0.02 + 0.07 * u[1] ** 2
-    tint = 0.18 * u[2] if dusk else 0.7 * u[2] - 0.4
-    low: Colour = _grey(level * 1.3, -0.1 if dusk else tint)
-    return Atmosphere(
-        "night",
-        light=(light * (1 - 0.3 * tint), light, light * (1 + 0.3 * tint)),
-        sky_top=_grey(level * 0.75, tint),
-        sky_low=low,
-        cloud=0.5 * u[3] if dusk else 0.0,
-        haze=low,
-        extinction=0.002,
-        headlamp=0.45 + 0.75 * u[4],
-        lamps=1.0,
-        glow=0.7 + 0.6 * u[5],
-        wet=0.7 * max(0.0, u[3] * 2 - 1),
-    )
 
 
 @lru_cache(maxsize=4)
@@ -207,14 +45,6 @@ def _ground_noise(width: int, height: int) -> Image:
     # Far rows would alias: fade them out.
     grid = 128 + (grid - 128) * np.clip(rows / (0.25 * height), 0.15, 1)
     return np.asarray(np.repeat(np.clip(grid, 0, 255)[..., None], 3, axis=2), np.uint8)
-
-
-@lru_cache(maxsize=4)
-def _sensor_noise(width: int, height: int) -> Image:
-    """Gaussian noise, mean 128 and deviation 32, [height + 64, width + 64, 3]."""
-    noise = np.random.default_rng(2).normal(128, 32, (height + 64, width + 64, 3))
-    noise = 0.6 * noise + 0.4 * noise.mean(axis=2, keepdims=True)
-    return np.asarray(np.clip(noise, 0, 255), np.uint8)
 
 
 @lru_cache(maxsize=16)
@@ -260,7 +90,7 @@ def _halo() -> NDArray[np.float32]:
     return np.asarray(np.clip(sprite, 0, 1)[..., None], np.float32)
 
 
-def _crop(bank: NDArray[np.generic], height: int, width: int, rng: np.random.Generator) -> Image:
+def crop(bank: NDArray[np.generic], height: int, width: int, rng: np.random.Generator) -> Image:
     """Random window [height, width, ...] of a noise bank."""
     y, x = (
         int(rng.integers(0, n - m + 1)) for n, m in zip(bank.shape, (height, width), strict=False)
@@ -282,7 +112,7 @@ def paint_sky(image: Image, air: Atmosphere, horizon: int, rng: np.random.Genera
     column = np.clip(np.array(air.sky_top) * (1 - t) + np.array(air.sky_low) * t, 0, 255)
     sky = _widen(column, width)
     if air.cloud > 0.02:
-        noise = _crop(_clouds(width, image.shape[0]), horizon, width, rng)
+        noise = crop(_clouds(width, image.shape[0]), horizon, width, rng)
         bright = 235 * min(1.0, air.light[1]) if air.condition == "sunny" else 0.6 * air.sky_low[1]
         opacity = cv2.convertScaleAbs(noise, alpha=air.cloud)
         blue = cv2.subtract(sky, cv2.multiply(sky, opacity, scale=1 / 255))
@@ -361,7 +191,7 @@ def add_precipitation(image: Image, air: Atmosphere, rng: np.random.Generator) -
     height, width = image.shape[:2]
     if air.condition not in ("rain", "snow"):
         return image
-    layer = _crop(
+    layer = crop(
         _falling(width, height, air.condition, min(3, int(4 * air.fall))), height, width, rng
     )
     image = np.asarray(cv2.add(image, layer), np.uint8)
@@ -369,48 +199,10 @@ def add_precipitation(image: Image, air: Atmosphere, rng: np.random.Generator) -
         # A drop is a tiny fish-eye: it shows the blurred picture upside down and brighter.
         small = cv2.resize(image, (width // 8, height // 8), interpolation=cv2.INTER_AREA)
         lens = cv2.resize(small[::-1], (width, height))
-        mask = _crop(_drop_mask(width, height, int(2.99 * air.drops)), height, width, rng)
+        mask = crop(_drop_mask(width, height, int(2.99 * air.drops)), height, width, rng)
         image = np.asarray(image + (lens.astype(np.float32) - image) * mask, np.uint8)
         if air.drops > 0.6:
             image = np.asarray(
                 cv2.addWeighted(image, 0.8, cv2.resize(small, (width, height)), 0.2, 0), np.uint8
             )
-    return image
-
-
-@lru_cache(maxsize=16)
-def _vignette(width: int, height: int, level: int) -> Image:
-    """Brightness factor times 255 that falls to the corners, level 0..3, [height, width, 3]."""
-    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
-    fall = 1 - (0.1 + 0.15 * level) * ((x**2 + y**2) / 2) ** 1.3
-    return np.repeat((255 * fall).astype(np.uint8)[..., None], 3, axis=2)
-
-
-def expose(image: Image, rng: np.random.Generator, *, dark: bool) -> Image:
-    """Camera: optics, exposure, white balance, contrast, saturation, noise and JPEG."""
-    height, width = image.shape[:2]
-    u = rng.random(12)
-    if u[0] < 0.5:
-        image = np.asarray(
-            cv2.GaussianBlur(image, (3, 3) if width < 600 else (5, 5), 0.4 + 0.7 * u[1]), np.uint8
-        )
-    if u[2] < 0.5:
-        image = np.asarray(
-            cv2.multiply(image, _vignette(width, height, int(8 * u[2])), scale=1 / 255), np.uint8
-        )
-    s = 0.65 + 0.7 * u[3]
-    grey = (1 - s) * np.array([0.299, 0.587, 0.114])
-    mix = np.eye(3, dtype=np.float32) * s + grey[None]
-    balance = np.array([1 + 0.14 * (u[4] - 0.5), 1 + 0.03 * (u[5] - 0.5), 1 + 0.14 * (u[6] - 0.5)])
-    image = np.asarray(cv2.transform(image, mix * balance[:, None]), np.uint8)
-    ramp = np.linspace(0, 1, 256) ** (0.85 + 0.35 * u[7]) * (0.85 + 0.3 * u[8])
-    ramp = np.clip(ramp, 0, 1) * (1 - 0.08 * u[9]) + (0.0 if dark else 0.05 * u[9])
-    image = np.asarray(cv2.LUT(image, (255 * ramp).astype(np.uint8)), np.uint8)
-    strength = (0.05 + 0.2 * u[10] ** 2) * (1.3 if dark else 1.0)
-    noise = _crop(_sensor_noise(width, height), height, width, rng)
-    image = np.asarray(cv2.addWeighted(image, 1.0, noise, strength, -128 * strength), np.uint8)
-    if u[11] < 0.3:
-        quality = [cv2.IMWRITE_JPEG_QUALITY, 30 + int(190 * u[11])]
-        coded = cv2.imencode(".jpg", image, quality)[1]
-        image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
     return image

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from data.synthetic import Scene, describe, draw_layout, render, sample_scene, with_condition
+from data.scene import Scene, describe, sample_scene, with_condition
+from data.street import draw_layout
+from data.synthetic import render
 from ridetune.sample import CONDITIONS, Condition
 
 BASE = Scene("sunny", "left curve", "near", "dense", "city", seed=7)
