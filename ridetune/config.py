@@ -33,6 +33,8 @@ def load_config(kind: type[Config], path: Path, overrides: Sequence[str] = ()) -
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
+        if first["type"] in ("missing", "missing_argument"):
+            raise ValueError(f"{path}: the key {key!r} is missing") from error
         raise ValueError(f"{path}: {key}: {first['msg']}, got {first['input']!r}") from error
 
 
@@ -52,7 +54,10 @@ def _override(raw: dict[str, Any], override: str) -> None:
         if not isinstance(inner, dict):
             raise ValueError(f"override {override!r}: {section} is a value, not a section")
         raw = inner
-    raw[last] = yaml.safe_load(value)
+    try:
+        raw[last] = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ValueError(f"override {override!r}: the value is not valid YAML") from error
 
 
 def _check_keys(kind: Any, raw: Mapping[str, Any], where: str) -> None:

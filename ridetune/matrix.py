@@ -123,8 +123,9 @@ class Ranges:
             )
         except KeyError as error:
             raise ValueError(f"{where}: the entry {error} is missing") from error
-        if default.ki > ki_limit(default.kp):
-            raise ValueError(f"{where}: the default matrix breaks K_i <= K_p^2/8")
+        except TypeError as error:
+            raise ValueError(f"{where}: an entry has the wrong form: {error}") from error
+        _check_vehicle(ranges, where)
         return ranges
 
     @staticmethod
@@ -132,7 +133,25 @@ class Ranges:
         """Read a ranges YAML file; ValueError names the file and the wrong entry."""
         if not path.is_file():
             raise ValueError(f"no ranges file at {path}; configs/ranges.yaml is the shipped one")
-        return Ranges.parse(yaml.safe_load(path.read_text()), where=str(path))
+        try:
+            raw = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise ValueError(f"{path} is not valid YAML: {error}") from error
+        return Ranges.parse(raw, where=str(path))
+
+
+def _check_vehicle(ranges: Ranges, where: str) -> None:
+    if not 0 < ranges.slew <= 1:
+        raise ValueError(f"{where}: slew must be a share in (0, 1], got {ranges.slew}")
+    for name, value, low, high in zip(
+        PARAMETERS, ranges.default.values, ranges.lowest, ranges.highest, strict=True
+    ):
+        if low == high:
+            raise ValueError(f"{where}: {name} has no room, all its limits are {low}")
+        if not low <= value <= high:  # also catches NaN
+            raise ValueError(f"{where}: the default {name} = {value} is outside [{low}, {high}]")
+    if ranges.default.ki > ki_limit(ranges.default.kp):
+        raise ValueError(f"{where}: the default matrix breaks K_i <= K_p^2/8")
 
 
 def _style_ranges(
@@ -140,13 +159,18 @@ def _style_ranges(
 ) -> tuple[ParameterRange, ...]:
     ranges = []
     for name in PARAMETERS:
-        if len(raw[name]) != 4:
-            raise ValueError(f"{where}: styles.{style}.{name} needs 4 numbers, got {raw[name]}")
-        minimum, lower, upper, maximum = (float(value) for value in raw[name])
+        try:
+            minimum, lower, upper, maximum = (float(value) for value in raw[name])
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{where}: styles.{style}.{name} needs 4 numbers, got {raw[name]}"
+            ) from error
         numbers = (minimum, lower, upper, maximum)
         if not all(math.isfinite(n) for n in numbers) or list(numbers) != sorted(numbers):
             raise ValueError(
                 f"{where}: styles.{style}.{name} must rise from minimum to maximum, got {raw[name]}"
             )
+        if minimum < 0:
+            raise ValueError(f"{where}: styles.{style}.{name} must not be negative, got {minimum}")
         ranges.append(ParameterRange(minimum, lower, upper, maximum))
     return tuple(ranges)

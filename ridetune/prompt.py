@@ -12,6 +12,7 @@ change here is a new PROMPT_VERSION.
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +69,7 @@ class PromptBuilder:
 
     def prefix(self) -> list[int]:
         """System message and image: the same ids for every frame of this camera."""
-        pads = IMAGE * (self.rows * self.columns)
-        return self._encode(
-            f"<|im_start|>system\n{SYSTEM}{END}\n"
-            f"<|im_start|>user\n<|vision_start|>{pads}<|vision_end|>"
-        )
+        return list(self._prefix)
 
     def suffix(self, instruction: str, memories: Sequence[Memory] = ()) -> list[int]:
         """Memories and instruction up to where the assistant answers; InstructionError if unfit."""
@@ -93,24 +90,30 @@ class PromptBuilder:
         where it starts, and text goes on after its longer side. `start` is the first position of
         a suffix that follows an already read prefix.
         """
-        columns: list[tuple[int, int, int]] = []
-        position, pad = start, 0
-        for token in ids:
-            if token == self.ids.image:
-                row, column = divmod(pad, self.columns)
-                columns.append((position, position + row, position + column))
-                pad += 1
-                if pad == self.rows * self.columns:
-                    position += max(self.rows, self.columns)
-                    pad = 0
-            else:
-                columns.append((position, position, position))
-                position += 1
-        return np.asarray(columns, np.int64).reshape(-1, 3).T
+        is_image = np.asarray(ids) == self.ids.image
+        if not is_image.any():
+            return np.tile(np.arange(start, start + len(ids)), (3, 1))
+        num_pads, longer = self.rows * self.columns, max(self.rows, self.columns)
+        pad = np.maximum(np.cumsum(is_image) - 1, 0)  # number of the image token so far
+        images_before = np.where(is_image, pad // num_pads, np.cumsum(is_image) // num_pads)
+        text = np.cumsum(~is_image) - ~is_image  # text tokens before this one
+        base = start + text + images_before * longer
+        row, column = np.divmod(pad % num_pads, self.columns)
+        return np.stack([base, base + is_image * row, base + is_image * column])
 
     def next_position(self, ids: Sequence[int]) -> int:
         """The position of the first token after a prefix."""
         return int(self.positions(ids).max()) + 1
+
+    @cached_property
+    def _prefix(self) -> tuple[int, ...]:
+        pads = IMAGE * (self.rows * self.columns)
+        return tuple(
+            self._encode(
+                f"<|im_start|>system\n{SYSTEM}{END}\n"
+                f"<|im_start|>user\n<|vision_start|>{pads}<|vision_end|>"
+            )
+        )
 
     def _remember(self, memory: Memory) -> str:
         actions = "".join(ACTION_TOKENS[b] for b in self.codec.encode(memory.matrix))

@@ -23,6 +23,10 @@ class VisionFeatures:
     tokens: Tensor
     deepstack: tuple[Tensor, ...]
 
+    def select(self, frames: list[int]) -> "VisionFeatures":
+        """The features of some frames, in that order."""
+        return VisionFeatures(self.tokens[frames], tuple(d[frames] for d in self.deepstack))
+
 
 def load_model(folder: Path, *, dtype: torch.dtype = torch.float32) -> PreTrainedModel:
     """Load a Qwen-VL model from a folder, safetensors only; ValueError if there is none."""
@@ -92,4 +96,4 @@ def run_tokens(
 def action_logits(model: Any, hidden: Tensor, token_ids: TokenIds) -> Tensor:
     """Hidden states [..., hidden] -> logits over the 256 action tokens [..., 256]."""
     rows = torch.tensor(token_ids.actions, device=hidden.device)
-    return hidden @ model.get_output_embeddings().weight[rows].T
+    return torch.as_tensor(hidden @ model.get_output_embeddings().weight[rows].T)

@@ -4,7 +4,9 @@ An Observation and an instruction go in; a Sample adds the label and the targets
 needs. A row is a Sample as the dataset file holds it: plain values, the frame as encoded bytes.
 """
 
+import random
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ridetune.matrix import NUM_PARAMETERS, ControllerMatrix, Style
@@ -130,6 +132,27 @@ def dataset_features() -> Any:
             "image": Image(decode=False),
             "memories": [memory],
             "matrix": matrix,
-            **{name: text for name in _PLAIN_FIELDS},
+            **dict.fromkeys(_PLAIN_FIELDS, text),
         }
     )
+
+
+def read_samples(path: Path) -> list[Sample]:
+    """All samples of a parquet file; ValueError if it is missing, damaged or empty."""
+    import pyarrow.parquet as parquet
+
+    if not path.is_file():
+        raise ValueError(f"no dataset at {path}; run `make data`, or set `data` in the config")
+    try:
+        rows = parquet.read_table(path).to_pylist()
+    except OSError as error:
+        raise ValueError(f"{path} is damaged ({error}); build the dataset again") from error
+    if not rows:
+        raise ValueError(f"{path} holds no samples; build the dataset with more scenes")
+    return [Sample.of_row(row) for row in rows]
+
+
+def some_of(samples: list[Sample], count: int, seed: int = 0) -> list[Sample]:
+    """A fixed random part of the samples; all of them where there are fewer."""
+    order = random.Random(seed).sample(range(len(samples)), min(count, len(samples)))
+    return [samples[i] for i in sorted(order)]

@@ -1,5 +1,7 @@
 """How a stage is run: arguments -> config -> work -> manifest; errors in one clear sentence.
 
+Every stage's main hands its config class and its work to `run_stage`:
+
     python -m data --config configs/data.yaml seed=3
 """
 
@@ -63,7 +65,11 @@ def explain_os_error(error: OSError) -> str:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A folder that appears at `out` whole or not at all; an older one is replaced."""
+    """A folder that appears at `out` whole or not at all; an older one is replaced.
+
+    Raises ValueError where `out` is no folder, or holds the working or the home folder.
+    """
+    _check_replaceable(out)
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -75,6 +81,15 @@ def new_folder(out: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
+
+
+def _check_replaceable(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file; choose another `out` folder")
+    if any(place.is_relative_to(out.resolve()) for place in (Path.cwd(), Path.home())):
+        raise ValueError(
+            f"{out} holds more than a run, replacing it would delete that; name a new folder"
+        )
 
 
 def write_manifest(folder: Path, *, seconds: float, facts: dict[str, Any]) -> None:
