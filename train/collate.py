@@ -1,4 +1,4 @@
-"""Samples -> padded batches of token ids, patches and targets.
+"""Samples -> padded batches of token ids and targets.
 
     parallel   prefix  suffix  query x 6 | action x 6  scene; explanation  END
     as text    prefix  suffix            | matrix as text  END                (the paper's way)
@@ -6,8 +6,8 @@
 Loss is taken at the six queries (a soft target over the bins) and on the text behind the bar.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,12 +27,11 @@ class Example:
     first_query: int | None
     bins: tuple[int, ...]
     first_target: int
-    patches: NDArray[np.float32] | None
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Tensors of several examples; positions [3, sample, token], patches [sample, patch, values].
+    """Tensors of several examples; ids [sample, token], positions [3, sample, token].
 
     queries [n, 6] holds token indices of the samples in query_rows [n], bins [n, 6] their labels.
     text_rows, text_at and text_ids say which token follows which position.
@@ -40,7 +39,6 @@ class Batch:
 
     ids: Tensor
     positions: Tensor
-    patches: Tensor | None
     query_rows: Tensor
     queries: Tensor
     bins: Tensor
@@ -50,10 +48,7 @@ class Batch:
 
     def to(self, device: torch.device) -> "Batch":
         """The same batch on another device."""
-        moved = {
-            name: None if value is None else value.to(device) for name, value in vars(self).items()
-        }
-        return Batch(**moved)
+        return Batch(**{name: tensor.to(device) for name, tensor in vars(self).items()})
 
 
 def answer_text(sample: Sample) -> str:
@@ -62,16 +57,16 @@ def answer_text(sample: Sample) -> str:
 
 
 def tokenize(
-    sample: Sample,
-    prompts: PromptBuilder,
-    patches: NDArray[np.float32] | None,
-    *,
-    as_text: bool = False,
+    sample: Sample, prompts: PromptBuilder, *, image: bool = True, as_text: bool = False
 ) -> Example:
-    """One sample as ids and targets; ValueError names a sample whose label cannot be coded."""
+    """One sample as ids and targets; ValueError names a sample whose label cannot be coded.
+
+    image: False leaves the prefix out, for learning from words alone at the same positions.
+    """
     suffix = prompts.suffix(sample.instruction, sample.memories)
-    prompt = [*prompts.prefix(), *suffix] if patches is not None else suffix
-    start = 0 if patches is not None else prompts.next_position(prompts.prefix())
+    prefix = prompts.prefix()
+    prompt = [*prefix, *suffix] if image else suffix
+    start = 0 if image else prompts.next_position(prefix)
     try:
         bins = prompts.codec.encode(sample.matrix)
     except ValueError as error:
@@ -85,7 +80,7 @@ def tokenize(
         first_query, first_target = len(prompt), len(prompt) + 2 * len(bins)
     ids = [*prompt, *answer, prompts.ids.end]
     positions = prompts.positions(ids, start)
-    return Example(ids, positions, first_query, bins, first_target, patches)
+    return Example(ids, positions, first_query, bins, first_target)
 
 
 def collate(examples: Sequence[Example]) -> Batch:
@@ -108,12 +103,9 @@ def collate(examples: Sequence[Example]) -> Batch:
             text_rows.append(row)
             text_at.append(at - 1)
             text_ids.append(e.ids[at])
-    images = [e.patches for e in examples if e.patches is not None]
-    assert len(images) in (0, len(examples)), "a batch has an image in every sample or in none"
     return Batch(
         ids=ids,
         positions=positions,
-        patches=torch.from_numpy(np.stack(images)) if images else None,
         query_rows=torch.tensor(query_rows, dtype=torch.long),
         queries=torch.tensor([list(q) for q in queries], dtype=torch.long).view(-1, 6),
         bins=torch.tensor(bins, dtype=torch.long).view(-1, 6),
@@ -123,11 +115,10 @@ def collate(examples: Sequence[Example]) -> Batch:
     )
 
 
-def by_length(
-    items: Sequence[Example], size: int, rng: np.random.Generator, key: Callable[[Example], int]
-) -> list[list[Example]]:
-    """Batches of about equal length in random order: little padding, still well mixed."""
-    order = sorted(rng.permutation(len(items)), key=lambda i: key(items[i]) + rng.random())
-    batches = [[items[i] for i in order[at : at + size]] for at in range(0, len(order), size)]
-    rng.shuffle(batches)  # type: ignore[arg-type]
-    return batches
+def without_answer(example: Example) -> Example:
+    """The example up to its last query: for stages that learn the matrix alone."""
+    assert example.first_query is not None
+    end = example.first_query + len(example.bins)
+    return replace(
+        example, ids=example.ids[:end], positions=example.positions[:, :end], first_target=end
+    )

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ridetune.codec import NUM_BINS
 from ridetune.prompt import TokenIds
-from ridetune.qwen import action_logits, encode_frames, run_tokens
-from ridetune.vision import VisionSpec
+from ridetune.qwen import VisionFeatures, action_logits, run_tokens
 
 from .collate import Batch
 
@@ -33,17 +32,12 @@ class Loss:
 def batch_loss(
     model: Any,
     batch: Batch,
-    spec: VisionSpec,
+    features: VisionFeatures | None,
     token_ids: TokenIds,
     *,
     text_weight: float,
-    frozen_vision: bool = False,
 ) -> tuple[Loss, Tensor]:
     """One forward pass: the losses and the last hidden states [sample, token, hidden]."""
-    features = None
-    if batch.patches is not None:
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen_vision):
-            features = encode_frames(model, batch.patches, spec)
     hidden = run_tokens(model, batch.ids, batch.positions, features, token_ids)
     actions = _action_loss(model, batch, hidden, token_ids)
     text = _text_loss(model, batch, hidden)
