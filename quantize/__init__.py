@@ -1,0 +1,1 @@
+"""Merged model -> 4-bit AWQ checkpoint -> bundle for the car."""
