@@ -1,0 +1,1 @@
+"""Score a served bundle on held-out phrasings and unseen frames: `python -m evaluate`."""

@@ -1,0 +1,1 @@
+"""Serve a bundle behind the safety gate over HTTP: `python -m serve`."""
