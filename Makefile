@@ -6,12 +6,13 @@ VENV = .venv
 RUN = runs/tiny
 BASE = models/tiny
 FRAMES =
-PORT = 8077
+PORT = 8470
 
 PY = $(VENV)/bin/python
 INSTALLED = $(VENV)/.installed
 LIBRARY = $(wildcard ridetune/*.py ridetune/*/*.py)
 EXPORT = $(addprefix quantize/,export.py graphs.py onnx_files.py operators.py parity.py)
+BENCHMARK = quantize/benchmark.py quantize/served_memory.py
 CONTRACT = $(addprefix ridetune/,alignment.py codec.py config.py matrix.py sample.py stage.py)
 
 # Every model is a folder on this disk; nothing is looked up elsewhere.
@@ -31,12 +32,12 @@ train: $(RUN)/merged/manifest.json  ## Fine-tune with LoRA and merge the adapter
 quantize: $(RUN)/bundle/bundle.json  ## Quantize to 4-bit AWQ and export the bundle
 bench: $(RUN)/evaluation.json  ## Profile the bundle's latency and score what it does
 
-serve: $(RUN)/.profiled  ## Serve the bundle and the cockpit page (PORT=8077)
+serve: $(RUN)/.profiled  ## Serve the bundle on this machine (PORT=8470)
 	$(PY) -m serve --config configs/serve.yaml bundle=$(RUN)/bundle port=$(PORT)
 
-demo: $(RUN)/.profiled  ## Drive a few frames on the terminal (FRAMES=folder of images)
+demo: $(RUN)/.profiled  ## Ask the served bundle three things (FRAMES=folder of photos)
 	$(PY) -m serve.demo --config configs/demo.yaml \
-		bundle=$(RUN)/bundle data=$(RUN)/data $(if $(FRAMES),frames=$(FRAMES))
+		bundle=$(RUN)/bundle data=$(RUN)/data $(if $(FRAMES),"frames='$(FRAMES)'")
 
 test: $(INSTALLED)  ## Run the tests
 	$(PY) -m pytest
@@ -72,7 +73,7 @@ $(RUN)/merged/manifest.json: $(RUN)/data/manifest.json $(wildcard train/*.py) $(
 		base=$(BASE) data=$(RUN)/data adapter=$(RUN)/adapter out=$(RUN)/merged
 
 $(RUN)/awq/manifest.json: $(RUN)/merged/manifest.json \
-		$(filter-out $(EXPORT) quantize/benchmark.py,$(wildcard quantize/*.py)) \
+		$(filter-out $(EXPORT) $(BENCHMARK),$(wildcard quantize/*.py)) \
 		ridetune/awq_checkpoint.py ridetune/gemm.py ridetune/qwen.py \
 		configs/quantize.yaml | $(INSTALLED)
 	$(PY) -m quantize --config configs/quantize.yaml \
@@ -85,9 +86,10 @@ $(RUN)/bundle/bundle.json: $(RUN)/awq/manifest.json $(EXPORT) \
 
 # The benchmark writes its profile into bundle.json, which makes that file newer than itself:
 # the stamp is touched afterwards, so that neither rule starts the other again.
-$(RUN)/.profiled: $(RUN)/bundle/bundle.json quantize/benchmark.py configs/benchmark.yaml \
+$(RUN)/.profiled: $(RUN)/bundle/bundle.json $(BENCHMARK) configs/benchmark.yaml \
 		| $(INSTALLED)
-	$(PY) -m quantize.benchmark --config configs/benchmark.yaml
+	$(PY) -m quantize.benchmark --config configs/benchmark.yaml \
+		bundle=$(RUN)/bundle data=$(RUN)/data run=$(RUN) out=$(RUN)/profile
 	@touch $@
 
 $(RUN)/evaluation.json: $(RUN)/.profiled $(wildcard evaluate/*.py) $(LIBRARY) \

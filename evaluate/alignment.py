@@ -41,6 +41,7 @@ def score(
                 4,
             )
             for level in LEVELS
+            if any(s.level == level for s in samples)
         },
         "scenario_alignment": round(
             scenario_alignment([pair for c in ADVERSE for pair in pairs[c]], codec), 4

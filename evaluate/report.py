@@ -22,7 +22,7 @@ from ridetune.contract import load_tokenizer
 from ridetune.engines import Engine
 from ridetune.matrix import ControllerMatrix
 from ridetune.ort_engine import OrtEngine
-from ridetune.policy import Policy
+from ridetune.policy import Policy, read_text
 from ridetune.qwen import load_model
 from ridetune.sample import Sample, read_samples, some_of
 from ridetune.scene import SCENE_QUESTIONS, scene_answers
@@ -138,7 +138,7 @@ def score_text(
             prefix, prompts.suffix(sample.instruction, sample.memories), MAX_MATRIX_TOKENS
         )
         tokens.append(len(ids))
-        matrix = codec.parse(tokenizer.decode(ids))
+        matrix = codec.parse(read_text(tokenizer, ids))
         ranges = codec.ranges
         text_scores.append(
             command_alignment(matrix, sample.style, ranges) if matrix is not None else None

@@ -80,9 +80,8 @@ def _requests(config: BenchmarkConfig) -> list[tuple[bytes, str]]:
     """Frames at camera size with instructions, each used once in a round."""
     samples = read_samples(config.data / "test.parquet")
     rng = np.random.default_rng(0)
-    chosen = rng.choice(
-        len(samples), config.warm_ups + config.requests, replace=len(samples) < config.requests
-    )
+    count = config.warm_ups + config.requests
+    chosen = rng.choice(len(samples), count, replace=len(samples) < count)
     return [(camera_frame(samples[i], config), samples[i].instruction) for i in chosen]
 
 

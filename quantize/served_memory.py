@@ -79,8 +79,7 @@ def process_tree(pid: int) -> list[int]:
     """A process and all its descendants that still live."""
     found = [pid]
     for parent in found:
-        children = Path(f"/proc/{parent}/task/{parent}/children")
-        if children.is_file():
+        for children in Path(f"/proc/{parent}/task").glob("*/children"):  # of every thread
             found += [int(child) for child in children.read_text().split()]
     return found
 

@@ -17,6 +17,8 @@ from ridetune.matrix import NUM_PARAMETERS, PARAMETERS, ControllerMatrix, Ranges
 NUM_BINS = 256
 # Where the scale turns from linear to logarithmic, per parameter in the order of PARAMETERS.
 KNEES = (0.05, 0.001, 0.1, 0.02, 1.0, 0.05)
+# A matrix that went through float32 may miss a bound by its last digit.
+ROUNDING = 1e-6
 
 _NUMBER = r"(\d{1,2}\.\d{3,4})"
 _TEXT = re.compile(
@@ -48,9 +50,11 @@ class MatrixCodec:
         bins = []
         for i, value in enumerate(matrix.values):
             low, high = self.ranges.lowest[i], self.ranges.highest[i]
-            if not low <= value <= high:  # also catches NaN
+            slack = ROUNDING * (high - low)
+            if not low - slack <= value <= high + slack:  # also catches NaN
                 raise ValueError(f"{PARAMETERS[i]} = {value} lies outside [{low}, {high}]")
-            bins.append(round(self.share(value, i) * (NUM_BINS - 1)))
+            share = self.share(min(max(value, low), high), i)
+            bins.append(round(share * (NUM_BINS - 1)))
         return tuple(bins)
 
     def decode(self, bins: Sequence[float]) -> ControllerMatrix:

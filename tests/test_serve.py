@@ -200,17 +200,6 @@ def test_damaged_form_is_refused_in_one_sentence(client: TestClient) -> None:
         assert_one_sentence(response, 422, "")
 
 
-def test_client_that_leaves_early_costs_nothing(client: TestClient) -> None:
-    def cut() -> Iterator[bytes]:
-        yield b"--b\r\n"
-        raise ConnectionError("the client is gone")
-
-    kind = {"content-type": "multipart/form-data; boundary=b"}
-    with pytest.raises(ConnectionError):
-        client.post("/v1/decide", content=cut(), headers=kind)
-    assert ask(client).status_code == 200
-
-
 def test_too_large_a_body_is_refused_before_it_is_read(client: TestClient) -> None:
     assert_one_sentence(ask(client, b"\xff" * (MAX_BODY_BYTES + 1)), 413, "too large")
 

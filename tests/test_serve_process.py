@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -102,6 +103,18 @@ def test_second_server_on_the_port_says_so(server: Server) -> None:
     errors = [line for line in done.stderr.splitlines() if not line.startswith("event=")]
     assert len(errors) == 1
     assert f"port {server.port} on 127.0.0.1 is in use" in errors[0]
+
+
+def test_client_that_leaves_in_the_middle_costs_nothing(server: Server) -> None:
+    head = (
+        "POST /v1/decide HTTP/1.1\r\nHost: car\r\nContent-Length: 5000\r\n"
+        "Content-Type: multipart/form-data; boundary=b\r\n\r\n--b\r\n"
+    )
+    for _ in range(10):  # more than the queue holds
+        with socket.create_connection(("127.0.0.1", server.port)) as client:
+            client.sendall(head.encode())
+    wait_for(lambda: server.ask("I am late").status_code == 200, 5)
+    assert "Traceback" not in server.log.read_text()
 
 
 def test_server_outlives_the_death_of_its_model(server: Server) -> None:

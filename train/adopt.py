@@ -54,6 +54,8 @@ def adopt(config: AdoptConfig) -> None:
             f"the embedding table of {config.base} has {room} rows, the tokens need {needed}; "
             "resize it first (transformers: model.resize_token_embeddings)"
         )
+    if config.base.resolve().is_relative_to(config.out.resolve()):
+        raise ValueError(f"{config.out} would replace the published model; name a new `out` folder")
     spec = read_vision_spec(config.base, config.rows, config.columns)
     with new_folder(config.out) as folder:
         for path in sorted(config.base.glob("*.json")):

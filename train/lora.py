@@ -36,14 +36,16 @@ class LoraShape:
 
 def add_adapter(model: Any, shape: LoraShape, token_ids: TokenIds) -> Any:
     """The model under a fresh adapter; only the adapter trains."""
-    new_rows = sorted([*token_ids.actions, *token_ids.queries]) if shape.train_tokens else None
+    rows = sorted([*token_ids.actions, *token_ids.queries])
+    # Both tables: the 7-8 B models have a head of their own (peft keeps tied ones tied).
+    tables = {"embed_tokens": rows, "lm_head": rows} if shape.train_tokens else None
     config = LoraConfig(
         r=shape.rank,
         lora_alpha=shape.alpha,
         lora_dropout=shape.dropout,
         target_modules=TARGETS,
         bias="none",
-        trainable_token_indices=new_rows,
+        trainable_token_indices=tables,
     )
     return get_peft_model(model, config)
 

@@ -31,7 +31,7 @@ def query_logits(
     for at in range(0, len(samples), batch_size):
         chosen = range(at, min(at + batch_size, len(samples)))
         rows = [tokenize(samples[i], prompts, image=features is not None) for i in chosen]
-        batch = collate([without_answer(row) for row in rows])
+        batch = collate([without_answer(row) for row in rows]).to(model.device)
         own = None if features is None else features.select(list(chosen))
         hidden = run_tokens(model, batch.ids, batch.positions, own, prompts.ids)
         at_queries = hidden[batch.query_rows[:, None], batch.queries]
@@ -49,7 +49,7 @@ def decode_matrices(
     """The matrix that the model proposes for each sample."""
     training = model.training
     model.eval()
-    logits = query_logits(model, prompts, samples, features).numpy()
+    logits = query_logits(model, prompts, samples, features).cpu().numpy()
     model.train(training)
     return [contract.codec.expect(row)[0] for row in logits]
 

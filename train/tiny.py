@@ -50,6 +50,7 @@ class TinyConfig:
     out: Path
     ranges: Path
     seed: int
+    device: str
     threads: int
     shape: TinyShape
     words: Steps
@@ -75,6 +76,7 @@ def pretrain(config: TinyConfig) -> None:
     prompts = contract.prompts(tokenizer)
     model = build_model(config.shape, tokenizer)
     start_embeddings(model, prompts, teacher)
+    model.to(torch.device(config.device))
 
     learn_words(model, contract, prompts, phrases, held_out, teacher, config)
     samples = read_samples(config.data / "train.parquet")
@@ -114,14 +116,18 @@ def learn_words(
     teacher: Teacher,
     config: TinyConfig,
 ) -> None:
-    """Stage one: no image, no answer text; the last query also predicts the teacher's vector."""
-    target, has_target = teacher_targets(phrases, teacher)
+    """Stage one: no image, no answer text; the last query also predicts the teacher's vector.
+
+    Rows with memories are three times as long, so only every second of them takes part.
+    """
+    phrases = [sample for i, sample in enumerate(phrases) if not sample.memories or i % 2]
+    target, has_target = (t.to(model.device) for t in teacher_targets(phrases, teacher))
     torch.manual_seed(config.seed)
-    head = nn.Linear(config.shape.hidden, target.shape[1])
+    head = nn.Linear(config.shape.hidden, target.shape[1]).to(model.device)
 
     def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
         batch = collate([words_only(phrases[i], prompts) for i in chosen])
-        batch = drop_words(batch, prompts, config.word_dropout, rng)
+        batch = drop_words(batch, prompts, config.word_dropout, rng).to(model.device)
         loss, hidden = batch_loss(model, batch, None, prompts.ids, text_weight=0.0)
         last = hidden[batch.query_rows, batch.queries[:, -1]]
         distances = (head(last) - target[chosen]).square().mean(dim=1) * has_target[chosen]
@@ -159,18 +165,17 @@ def learn_pictures(
     config: TinyConfig,
 ) -> None:
     """Stage two: the vision tower alone, with one throw-away head per question and depth."""
-    answers = torch.tensor([scene_answers(sample.scene) for sample in samples])
+    answers = torch.tensor([scene_answers(sample.scene) for sample in samples]).to(model.device)
     sizes = [len(options) for options in SCENE_QUESTIONS.values()]
     width = contract.vision.num_tokens * config.shape.hidden
     torch.manual_seed(config.seed)
-    last = nn.Linear(width, sum(sizes))
-    middle = nn.Linear(width, sum(sizes))
+    last = nn.Linear(width, sum(sizes)).to(model.device)
+    middle = nn.Linear(width, sum(sizes)).to(model.device)
     augment = Augment()
 
     def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
-        features = encode_frames(
-            model, patches_of(pixels[chosen], contract.vision, augment, rng), contract.vision
-        )
+        patches = patches_of(pixels[chosen], contract.vision, augment, rng).to(model.device)
+        features = encode_frames(model, patches, contract.vision)
         logits = last(features.tokens.flatten(1)) + middle(features.deepstack[0].flatten(1))
         losses = [
             F.cross_entropy(part, answers[chosen, question])
@@ -201,7 +206,7 @@ def learn_both(
             batch = collate([words_only(phrases[i], prompts) for i in picked])
             features = None
         else:
-            patches = patches_of(pixels[chosen], contract.vision, augment, rng)
+            patches = patches_of(pixels[chosen], contract.vision, augment, rng).to(model.device)
             features = encode_frames(model, patches, contract.vision)
             as_text = rng.random(len(chosen)) < config.as_text_share
             rows = [
@@ -209,7 +214,7 @@ def learn_both(
                 for i, text in zip(chosen, as_text, strict=True)
             ]
             batch = collate(rows)
-        batch = drop_words(batch, prompts, config.word_dropout, rng)
+        batch = drop_words(batch, prompts, config.word_dropout, rng).to(model.device)
         loss, _ = batch_loss(model, batch, features, prompts.ids, text_weight=config.text_weight)
         return loss.total
 
