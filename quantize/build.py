@@ -26,7 +26,7 @@ from .calibration import (
     CalibrationPrompt,
     Reader,
     hold_apart,
-    read_samples,
+    read_calibration,
     record_activations,
     write_prompt,
 )
@@ -63,7 +63,7 @@ def quantize(config: QuantizeConfig) -> None:
         raise ValueError(f"out and model are both {config.out}; choose another `out` folder")
     torch.set_num_threads(config.threads)
     reader = Reader.load(config.model)
-    to_fit, to_check = hold_apart(read_samples(config.data), config.check_scenes)
+    to_fit, to_check = hold_apart(read_calibration(config.data), config.check_scenes)
     check_prompts = [write_prompt(sample, reader) for sample in to_check]
 
     model = _load_source(config)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as parquet
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -20,7 +19,7 @@ from tqdm import tqdm
 from ridetune.contract import Contract, load_tokenizer
 from ridetune.prompt import PromptBuilder, TokenIds
 from ridetune.qwen import core, encode_frames, run_tokens
-from ridetune.sample import Sample
+from ridetune.sample import Sample, read_samples
 from ridetune.vision import VisionSpec, read_patches
 
 CALIBRATION_FILE = "calibration.parquet"
@@ -69,15 +68,9 @@ class Activations:
     tokens: Tensor
 
 
-def read_samples(data: Path) -> list[Sample]:
+def read_calibration(data: Path) -> list[Sample]:
     """The calibration split of a dataset folder; ValueError if there is none."""
-    path = data / CALIBRATION_FILE
-    if not path.is_file():
-        raise ValueError(f"no {CALIBRATION_FILE} in {data}; `python -m data` writes one")
-    samples = [Sample.of_row(row) for row in parquet.read_table(path).to_pylist()]
-    if not samples:
-        raise ValueError(f"{path} holds no samples; set calibration_scenes in configs/data.yaml")
-    return samples
+    return read_samples(data / CALIBRATION_FILE)
 
 
 def hold_apart(samples: Sequence[Sample], num_scenes: int) -> tuple[list[Sample], list[Sample]]:

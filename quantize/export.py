@@ -53,7 +53,7 @@ from ridetune.stage import (
 from ridetune.torch_engine import TorchEngine
 from ridetune.vision import read_patches
 
-from .calibration import read_samples
+from .calibration import read_calibration
 from .onnx_files import LoadedModel, set_accuracy_level, write_graphs
 from .parity import (
     Answer,
@@ -144,7 +144,7 @@ def read_family(folder: Path) -> str:
 
 def parity_prompts(config: ExportConfig, contract: Contract) -> list[ParityPrompt]:
     """Evenly spaced samples of the calibration split as frame and suffix."""
-    samples = read_samples(config.data)
+    samples = read_calibration(config.data)
     if config.gate.samples < 1:
         raise ValueError(f"gate.samples is {config.gate.samples}; compare at least one prompt")
     chosen = np.linspace(0, len(samples) - 1, min(config.gate.samples, len(samples))).astype(int)

@@ -28,7 +28,7 @@ from quantize.calibration import (
     Activations,
     Reader,
     hold_apart,
-    read_samples,
+    read_calibration,
     record_activations,
     run_prompt,
     write_prompt,
@@ -222,7 +222,7 @@ def test_loaded_model_holds_exactly_the_dequantized_weights(quantized: Path) -> 
 
 def test_folding_leaves_the_unrounded_model_as_it_was(source: Path, dataset: Path) -> None:
     reader = Reader.load(source)
-    prompts = [write_prompt(sample, reader) for sample in read_samples(dataset)[:3]]
+    prompts = [write_prompt(sample, reader) for sample in read_calibration(dataset)[:3]]
     model: Any = load_model(source, dtype=torch.float64)
     before = run_prompt(model, prompts[0], reader)
     seen = record_activations(model, prompts, reader, tokens=64, seed=0)
@@ -238,7 +238,7 @@ def test_recorded_mean_is_over_all_tokens_and_kept_tokens_are_a_part(
     source: Path, dataset: Path
 ) -> None:
     reader = Reader.load(source)
-    prompts = [write_prompt(sample, reader) for sample in read_samples(dataset)[:2]]
+    prompts = [write_prompt(sample, reader) for sample in read_calibration(dataset)[:2]]
     model: Any = load_model(source)
     whole = record_activations(model, prompts, reader, tokens=10_000, seed=0)[0]
     part = record_activations(model, prompts, reader, tokens=20, seed=0)[0]
@@ -285,7 +285,7 @@ def test_clip_cuts_a_lone_outlier_weight_that_carries_no_activation() -> None:
 
 
 def test_scenes_of_the_check_are_not_calibrated_on(dataset: Path) -> None:
-    samples = read_samples(dataset)
+    samples = read_calibration(dataset)
     fit, check = hold_apart([*samples, *samples], 4)
     assert {s.scene_id for s in fit}.isdisjoint({s.scene_id for s in check})
     assert len(fit) == 2 * (NUM_SCENES - 4)
