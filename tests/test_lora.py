@@ -32,7 +32,6 @@ from train.lora import (
     merge,
 )
 from train.objective import batch_loss
-from train.rows import read_pixels
 from train.score import query_logits
 from train.sft import TrainConfig, encode_all, finetune, fingerprint
 
@@ -91,9 +90,9 @@ def assert_same(ours: dict[str, Tensor], theirs: dict[str, Tensor]) -> None:
 
 def logits_of(model: Any) -> Tensor:
     contract = Contract.load(small_base())
-    samples = small_samples()[:4]
+    samples = list(small_samples()[:4])
     with torch.no_grad():
-        seen = encode_all(model, read_pixels(samples, contract.vision), contract)
+        seen = encode_all(model, samples, contract)
         return query_logits(model, small_prompts(), samples, seen)
 
 
@@ -258,10 +257,23 @@ def copy_of(folder: Path, place: Path) -> Path:
     return Path(shutil.copytree(folder, place))
 
 
+def test_samples_without_any_text_train_too(tmp_path: Path, losses: Losses) -> None:
+    changes = ("plan.steps=2", "as_text_share=0.0", "explained_share=0.0")
+    finetune(train_config(tmp_path, *changes))
+    assert len(losses) == 2
+    assert np.isfinite(losses).all()
+
+
 def test_fingerprint_follows_all_that_shapes_the_steps(tmp_path: Path) -> None:
     ours = fingerprint(train_config(tmp_path))
     assert fingerprint(train_config(tmp_path / "elsewhere", "watch_samples=5")) == ours
-    for change in ("plan.steps=9", "lora.rank=8", "as_text_share=0.3", "text_weight=0.1"):
+    for change in (
+        "plan.steps=9",
+        "lora.rank=8",
+        "as_text_share=0.3",
+        "text_weight=0.1",
+        "explained_share=0.1",
+    ):
         assert fingerprint(train_config(tmp_path, change)) != ours
     base = copy_of(small_base(), tmp_path / "base")
     assert fingerprint(train_config(tmp_path, f"base={base}")) == ours

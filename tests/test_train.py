@@ -66,7 +66,7 @@ def model() -> Any:
 
 @pytest.fixture(scope="module")
 def features(model: Any, contract: Contract) -> VisionFeatures:
-    return encode_all(model, read_pixels(small_samples(), contract.vision), contract)
+    return encode_all(model, list(small_samples()), contract)
 
 
 @torch.no_grad()
@@ -207,6 +207,18 @@ def test_example_without_answer_ends_with_the_last_query() -> None:
     assert tuple(example.ids[-6:]) == prompts.ids.queries
     assert example.positions.shape == (3, len(example.ids))
     assert len(collate([example]).text_ids) == 0
+
+
+def test_each_sample_gets_the_visual_tokens_of_its_own_frame(
+    model: Any, contract: Contract, features: VisionFeatures
+) -> None:
+    samples = small_samples()
+    assert len({s.observation.frame for s in samples}) == 4
+    for number in (0, 5, 11):
+        alone = encode_all(model, [samples[number]], contract)
+        torch.testing.assert_close(features.select([number]).tokens, alone.tokens)
+        torch.testing.assert_close(features.deepstack[0][[number]], alone.deepstack[0])
+    assert not torch.allclose(features.tokens[0], features.tokens[11])
 
 
 def test_label_outside_the_envelope_names_the_sample() -> None:
