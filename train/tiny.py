@@ -61,7 +61,6 @@ class TinyConfig:
     as_text_share: float  # share of samples that answer the paper's way
     text_weight: float  # weight of the text loss beside the action loss
     phrases_in_both: float  # text-only batches in the last stage, as a share of all
-    keep_words: float  # how far the language model goes back to where stage one left it
 
 
 def pretrain(config: TinyConfig) -> None:
@@ -80,12 +79,10 @@ def pretrain(config: TinyConfig) -> None:
     model.to(torch.device(config.device))
 
     learn_words(model, contract, prompts, phrases, held_out, teacher, config)
-    knew_words = {n: w.clone() for n, w in model.model.language_model.state_dict().items()}
     samples = read_samples(config.data / "train.parquet")
     pixels = read_pixels(samples, contract.vision)
     learn_pictures(model, contract, samples, pixels, config)
     learn_both(model, contract, prompts, samples, pixels, phrases, held_out, config)
-    recall(model.model.language_model, knew_words, config.keep_words)
 
     with new_folder(config.out) as folder:
         model.half().save_pretrained(folder)
@@ -226,16 +223,6 @@ def learn_both(
 
     lengths = [text_length(sample) for sample in samples]
     train_steps("both", [model], lengths, loss_of, config.both, config.seed, watch=watch)
-
-
-def recall(part: nn.Module, earlier: dict[str, Tensor], share: float) -> None:
-    """Move the weights back towards earlier ones by a share (weight averaging, WiSE-FT 2022).
-
-    What stage three learns about images costs some of what stage one knew about words in unseen
-    wordings; between the two lies a model that has both.
-    """
-    now = part.state_dict()
-    part.load_state_dict({n: torch.lerp(now[n], earlier[n], share) for n in now})
 
 
 def words_only(sample: Sample, prompts: PromptBuilder) -> Example:
