@@ -22,6 +22,7 @@ from ridetune.vision import decode_frame
 
 TINY = (
     "train_scenes=24",
+    "instructions_per_frame=3",
     "calibration_scenes=4",
     "test_scenes=6",
     "phrases=40",
