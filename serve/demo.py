@@ -5,7 +5,6 @@ Starts a server of its own on this machine, waits until it is ready, asks, print
     python -m serve.demo --config configs/demo.yaml frames=my/photos
 """
 
-import signal
 import subprocess
 import sys
 import tempfile
@@ -136,13 +135,10 @@ def running_server(config: DemoConfig) -> Iterator[str]:
     values = [f"bundle={config.bundle.resolve()}", f"port={port}", *limits]
     with tempfile.TemporaryFile("w+") as log:
         server = subprocess.Popen([*command, *values], stdout=log, stderr=log)
-        # A terminated demo must not leave its server behind.
-        before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         try:
             _wait_until_ready(server, f"http://127.0.0.1:{port}", log)
             yield f"http://127.0.0.1:{port}"
         finally:
-            signal.signal(signal.SIGTERM, before)
             server.terminate()
             try:
                 server.wait(STOP_S)

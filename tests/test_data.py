@@ -1,6 +1,10 @@
 """The dataset build: deterministic, split by scene and words, and labelled by its own rules."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -212,3 +216,19 @@ def test_a_failed_build_leaves_nothing(
     with pytest.raises(OSError, match="No space left"):
         build(config)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_build_told_to_stop_leaves_nothing_behind(tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    command = [sys.executable, "-m", "data", f"out={out}", "train_scenes=100000"]
+    build = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 60
+        while not any(tmp_path.iterdir()) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert list(tmp_path.iterdir()) == [tmp_path / ".set.partial"]
+        build.terminate()
+        assert build.wait(timeout=60) == 128 + signal.SIGTERM
+    finally:
+        build.kill()
+    assert not list(tmp_path.iterdir())
