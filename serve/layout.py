@@ -31,7 +31,7 @@ def answer_lines(question: str, answer: DecisionOut) -> list[str]:
     lines += wrapped(_label("scene"), answer.scene or "(the model did not say)")
     lines += wrapped(_label("because"), _reason(answer.explanation))
     stages = "   ".join(f"{name} {ms[name]:.1f}" for name in _STAGES if name in ms)
-    lines += [f"{_label('time')}matrix after {ms['total']:.1f} ms   ({stages})"]
+    lines += wrapped(_label("time"), f"matrix after {ms['total']:.1f} ms   ({stages})")
     if "explain" in ms:
         lines += [f"{_label('')}scene and reason {ms['explain']:.1f} ms later"]
     return lines
