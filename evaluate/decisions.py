@@ -2,14 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from tqdm import tqdm
 
 from ridetune.codec import NUM_BINS, MatrixCodec
 from ridetune.matrix import NUM_PARAMETERS, ControllerMatrix
-from ridetune.policy import Policy, PreparedFrame
+from ridetune.policy import Policy
 from ridetune.sample import Memory, Sample
+
+# Prefilled frames in memory at once; samples of one frame stand together.
+FRAMES_KEPT = 64
 
 
 def propose(
@@ -20,15 +24,12 @@ def propose(
 ) -> list[ControllerMatrix]:
     """The proposal for each sample; a frame that several samples share is read once."""
     default = policy.contract.ranges.default
-    frames: dict[bytes, PreparedFrame] = {}
+    prepare = lru_cache(maxsize=FRAMES_KEPT)(policy.prepare)
     found = []
     for i, sample in enumerate(tqdm(samples, desc=about, unit="decision")):
-        frame = sample.observation.frame
-        if frame not in frames:
-            frames.clear() if len(frames) > 64 else None
-            frames[frame] = policy.prepare(frame)
+        frame = prepare(sample.observation.frame)
         past = memories[i] if memories is not None else sample.memories
-        decision = policy.decide(frames[frame], sample.instruction, past, last_safe=default)
+        decision = policy.decide(frame, sample.instruction, past, last_safe=default)
         found.append(decision.proposal)
     return found
 
