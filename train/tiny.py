@@ -1,6 +1,6 @@
 """Pretrain the tiny base in three stages: words, pictures, then both.
 
-    words      instruction and memories -> six bins, and MiniLM's vector of the instruction
+    words      instruction and memories -> six bins; train/words.py
     pictures   frame -> what is in the scene, through heads that are thrown away
     both       the whole prompt -> six bins, scene, explanation; a part of it as text
 
@@ -11,7 +11,7 @@ Hugging Face tools read it, in fp16. Trained once and committed as models/tiny.
 """
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +31,14 @@ from ridetune.scene import SCENE_QUESTIONS, scene_answers
 from ridetune.stage import Stopwatch, new_folder, run_stage, write_manifest
 
 from .base import TinyShape, build_model, build_tokenizer, save_tokenizer, vision_spec
-from .collate import Batch, Example, collate, tokenize, without_answer
+from .collate import collate, tokenize
 from .objective import batch_loss
 from .pixels import Augment, patches_of
 from .rows import read_phrases, read_pixels
-from .schedule import Steps, train_steps
+from .schedule import Steps, endless_batches, train_steps
 from .score import score_phrases
 from .teacher import Teacher
+from .words import WordsPlan, WordsTask, drop_words, learn_words, teach, text_length
 
 EMBEDDING_SCALE = 0.04
 
@@ -53,14 +54,13 @@ class TinyConfig:
     device: str
     threads: int
     shape: TinyShape
-    words: Steps
+    words: WordsPlan
     pictures: Steps
     both: Steps
     word_dropout: float  # share of instruction tokens replaced by [UNK]
-    distillation: float  # weight of the distance to the teacher's vector
-    as_text_share: float  # share of samples that answer the paper's way
+    as_text_share: float  # share of samples that answer the paper's way in the last stage
     text_weight: float  # weight of the text loss beside the action loss
-    phrases_in_both: float  # text-only batches in the last stage, as a share of all
+    words_in_both: float  # text-only batches in the last stage, as a share of all
 
 
 def pretrain(config: TinyConfig) -> None:
@@ -78,11 +78,13 @@ def pretrain(config: TinyConfig) -> None:
     start_embeddings(model, prompts, teacher)
     model.to(torch.device(config.device))
 
-    learn_words(model, contract, prompts, phrases, held_out, teacher, config)
+    lessons = teach(teacher, prompts, phrases, held_out, config.words, config.seed)
+    task = WordsTask(model, contract, prompts, lessons, config.word_dropout)
+    learn_words(model, contract, prompts, task, lessons, held_out, config.words, config.seed)
     samples = read_samples(config.data / "train.parquet")
     pixels = read_pixels(samples, contract.vision)
     learn_pictures(model, contract, samples, pixels, config)
-    learn_both(model, contract, prompts, samples, pixels, phrases, held_out, config)
+    learn_both(model, contract, prompts, samples, pixels, task, held_out, config)
 
     with new_folder(config.out) as folder:
         model.half().save_pretrained(folder)
@@ -94,67 +96,23 @@ def pretrain(config: TinyConfig) -> None:
 
 
 def start_embeddings(model: Any, prompts: PromptBuilder, teacher: Teacher) -> None:
-    """Word embeddings from the teacher; neighbouring action tokens start near each other."""
+    """Word embeddings from the teacher; neighbouring action tokens start near each other.
+
+    The teacher's words stay where they are: a word that training holds once would otherwise move
+    to fit its sentence, and words that it never holds would be left behind.
+    """
     table = model.get_input_embeddings().weight
     vocabulary = prompts.tokenizer.get_vocab()
-    pieces = [p for p in vocabulary if p in teacher.word_pieces]
+    pieces = sorted(p for p in vocabulary if p in teacher.word_pieces)
+    rows = torch.tensor([vocabulary[p] for p in pieces])
     with torch.no_grad():
         table.normal_(0, EMBEDDING_SCALE)
         vectors = torch.from_numpy(teacher.word_vectors(pieces, table.shape[1]))
-        table[[vocabulary[p] for p in pieces]] = vectors * EMBEDDING_SCALE
+        table[rows] = vectors * EMBEDDING_SCALE
         level = torch.linspace(0, 1, len(ACTION_TOKENS))[:, None]
         waves = level * torch.randn(1, table.shape[1]) * 6 + torch.rand(1, table.shape[1]) * 6.3
         table[list(prompts.ids.actions)] = torch.cos(waves) * EMBEDDING_SCALE
-
-
-def learn_words(
-    model: Any,
-    contract: Contract,
-    prompts: PromptBuilder,
-    phrases: list[Sample],
-    held_out: list[Sample],
-    teacher: Teacher,
-    config: TinyConfig,
-) -> None:
-    """Stage one: no image, no answer text; the last query also predicts the teacher's vector.
-
-    Rows with memories are three times as long, so only every second of them takes part.
-    """
-    phrases = [sample for i, sample in enumerate(phrases) if not sample.memories or i % 2]
-    target, has_target = (t.to(model.device) for t in teacher_targets(phrases, teacher))
-    torch.manual_seed(config.seed)
-    head = nn.Linear(config.shape.hidden, target.shape[1]).to(model.device)
-
-    def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
-        batch = collate([words_only(phrases[i], prompts) for i in chosen])
-        batch = drop_words(batch, prompts, config.word_dropout, rng).to(model.device)
-        loss, hidden = batch_loss(model, batch, None, prompts.ids, text_weight=0.0)
-        last = hidden[batch.query_rows, batch.queries[:, -1]]
-        distances = (head(last) - target[chosen]).square().mean(dim=1) * has_target[chosen]
-        return torch.as_tensor(loss.actions + config.distillation * distances.mean())
-
-    def watch() -> str:
-        return score_phrases(model, contract, prompts, held_out)
-
-    lengths = [text_length(sample) for sample in phrases]
-    parts = [model.model.language_model, head]
-    train_steps("words", parts, lengths, loss_of, config.words, config.seed, watch=watch)
-
-
-def teacher_targets(phrases: list[Sample], teacher: Teacher) -> tuple[Tensor, Tensor]:
-    """MiniLM's vector of each written sentence [phrase, 384], and whether there is one [phrase].
-
-    A sentence and its variations share one vector; what the grammar grew has none.
-    """
-    wordings: dict[str, str] = {}
-    for sample in phrases:
-        if not sample.phrase_id.startswith("grammar/"):
-            wordings.setdefault(sample.phrase_id, sample.instruction)
-    vectors = teacher.encode(list(wordings.values()), "teacher")
-    vectors = (vectors - vectors.mean(0)) / vectors.std()
-    row_of = {phrase_id: row for row, phrase_id in enumerate(wordings)}
-    rows = np.array([row_of.get(sample.phrase_id, -1) for sample in phrases])
-    return torch.from_numpy(vectors[rows]), torch.from_numpy(rows >= 0).float()
+    table.register_hook(lambda gradient: gradient.index_fill(0, rows.to(gradient.device), 0.0))
 
 
 def learn_pictures(
@@ -193,28 +151,25 @@ def learn_both(
     prompts: PromptBuilder,
     samples: list[Sample],
     pixels: NDArray[np.uint8],
-    phrases: list[Sample],
+    task: WordsTask,
     held_out: list[Sample],
     config: TinyConfig,
 ) -> None:
     """Stage three: everything together, with text-only batches mixed in to keep the words."""
     augment = Augment()
+    words = endless_batches(task.lengths, 2 * config.both.batch, config.seed + 1)
 
     def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
-        if rng.random() < config.phrases_in_both:
-            picked = rng.integers(len(phrases), size=2 * len(chosen))
-            batch = collate([words_only(phrases[i], prompts) for i in picked])
-            features = None
-        else:
-            patches = patches_of(pixels[chosen], contract.vision, augment, rng).to(model.device)
-            features = encode_frames(model, patches, contract.vision)
-            as_text = rng.random(len(chosen)) < config.as_text_share
-            rows = [
-                tokenize(samples[i], prompts, as_text=bool(text))
-                for i, text in zip(chosen, as_text, strict=True)
-            ]
-            batch = collate(rows)
-        batch = drop_words(batch, prompts, config.word_dropout, rng).to(model.device)
+        if rng.random() < config.words_in_both:
+            return task.actions(next(words), rng)[0]
+        patches = patches_of(pixels[chosen], contract.vision, augment, rng).to(model.device)
+        features = encode_frames(model, patches, contract.vision)
+        as_text = rng.random(len(chosen)) < config.as_text_share
+        rows = [
+            tokenize(samples[i], prompts, as_text=bool(text))
+            for i, text in zip(chosen, as_text, strict=True)
+        ]
+        batch = drop_words(collate(rows), prompts, config.word_dropout, rng).to(model.device)
         loss, _ = batch_loss(model, batch, features, prompts.ids, text_weight=config.text_weight)
         return loss.total
 
@@ -223,32 +178,6 @@ def learn_both(
 
     lengths = [text_length(sample) for sample in samples]
     train_steps("both", [model], lengths, loss_of, config.both, config.seed, watch=watch)
-
-
-def words_only(sample: Sample, prompts: PromptBuilder) -> Example:
-    """Memories and instruction up to the queries, without image and answer text."""
-    return without_answer(tokenize(sample, prompts, image=False))
-
-
-def text_length(sample: Sample) -> int:
-    """Characters of the prompt's own part: good enough to batch by."""
-    past = sum(len(m.instruction) + len(m.scene) + len(m.feedback) + 60 for m in sample.memories)
-    return len(sample.instruction) + past
-
-
-def drop_words(
-    batch: Batch, prompts: PromptBuilder, share: float, rng: np.random.Generator
-) -> Batch:
-    """Replace a share of the ordinary words before the answer by [UNK]: no word is decisive."""
-    unknown, first_special = prompts.ids.unknown, prompts.tokenizer.token_to_id("<|endoftext|>")
-    assert unknown is not None and first_special is not None, "the tiny tokenizer has both"
-    ids = batch.ids.clone()
-    drawn = torch.from_numpy(rng.random(ids.shape)) < share
-    prompt_end = torch.zeros(ids.shape[0], dtype=torch.long)
-    prompt_end[batch.query_rows] = batch.queries[:, 0]
-    before = torch.arange(ids.shape[1])[None, :] < prompt_end[:, None]
-    ids[drawn & before & (ids > unknown) & (ids < first_special)] = unknown
-    return replace(batch, ids=ids)
 
 
 def _corpus(phrases: list[Sample]) -> list[str]:

@@ -1,0 +1,221 @@
+"""Stage one of the tiny base: what a sentence asks for, before it has seen a picture.
+
+    written and grown sentences   their own labels
+    reworded sentences            the teacher's shares of the styles, as a mixture of labels
+    a part of the batches         the matrix as text, the paper's way
+
+Beside the six bins the last query learns to predict the teacher's vector of the sentence.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ridetune.codec import NUM_BINS, MatrixCodec
+from ridetune.contract import Contract
+from ridetune.matrix import NUM_PARAMETERS, STYLES
+from ridetune.prompt import PromptBuilder
+from ridetune.qwen import action_logits, run_tokens
+from ridetune.sample import Sample
+
+from .collate import Batch, Example, collate, tokenize, without_answer
+from .objective import batch_loss, soft_bins
+from .reword import Rewording
+from .schedule import Steps, train_steps
+from .score import score_phrases
+from .teacher import Teacher
+
+REWORDED = "reworded"
+
+
+@dataclass(frozen=True)
+class WordsPlan:
+    """How the words are learned, and from how many reworded sentences."""
+
+    steps: int
+    batch: int
+    learning_rate: float
+    teacher: Steps
+    rewordings: int
+    distillation: float  # weight of the distance to the teacher's vector
+    as_text_share: float  # share of batches that answer the paper's way
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """Samples with what the teacher says of them.
+
+    vectors [sample, 384] and whether there is one, has_vector [sample]; opinions [sample, 3] are
+    shares of the styles, used instead of the label where has_opinion [sample].
+    """
+
+    samples: list[Sample]
+    vectors: Tensor
+    has_vector: Tensor
+    opinions: Tensor
+    has_opinion: Tensor
+
+
+class WordsTask:
+    """The losses of sentences without images, for the first stage and to keep it in the last."""
+
+    def __init__(
+        self,
+        model: Any,
+        contract: Contract,
+        prompts: PromptBuilder,
+        lessons: Lessons,
+        word_dropout: float,
+    ) -> None:
+        self._model, self._prompts, self._lessons = model, prompts, lessons
+        self._word_dropout = word_dropout
+        self._of_style = bins_by_style(lessons.samples, contract.codec)
+        self.lengths = [text_length(sample) for sample in lessons.samples]
+
+    def actions(self, chosen: list[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Loss of the six bins, and the last hidden state of the last query [sample, hidden]."""
+        lessons, device = self._lessons, self._model.device
+        examples = [words_only(lessons.samples[i], self._prompts) for i in chosen]
+        batch = drop_words(collate(examples), self._prompts, self._word_dropout, rng).to(device)
+        hidden = run_tokens(self._model, batch.ids, batch.positions, None, self._prompts.ids)
+        at_queries = hidden[batch.query_rows[:, None], batch.queries]
+        mixed = torch.einsum("ns,spb->npb", lessons.opinions[chosen], self._of_style).to(device)
+        unsure = lessons.has_opinion[chosen].to(device)[:, None, None]
+        targets = torch.where(unsure, mixed, soft_bins(batch.bins))
+        logits = action_logits(self._model, at_queries, self._prompts.ids).float()
+        return F.cross_entropy(logits.flatten(0, 1), targets.flatten(0, 1)), at_queries[:, -1]
+
+    def text(self, chosen: list[int]) -> Tensor:
+        """Loss of the matrix as text; samples without a label of their own are left out."""
+        rows = [i for i in chosen if not self._lessons.has_opinion[i]] or [0]
+        samples = [self._lessons.samples[i] for i in rows]
+        examples = [tokenize(s, self._prompts, image=False, as_text=True) for s in samples]
+        batch = collate(examples).to(self._model.device)
+        return batch_loss(self._model, batch, None, self._prompts.ids, text_weight=1.0)[0].total
+
+
+def learn_words(
+    model: Any,
+    contract: Contract,
+    prompts: PromptBuilder,
+    task: WordsTask,
+    lessons: Lessons,
+    held_out: list[Sample],
+    plan: WordsPlan,
+    seed: int,
+) -> None:
+    """Train the language model on sentences and memories, without images."""
+    torch.manual_seed(seed)
+    head = nn.Linear(model.config.text_config.hidden_size, lessons.vectors.shape[1])
+    head.to(model.device)
+
+    def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
+        if rng.random() < plan.as_text_share:
+            return task.text(chosen)
+        actions, last = task.actions(chosen, rng)
+        far = head(last) - lessons.vectors[chosen].to(model.device)
+        known = lessons.has_vector[chosen].to(model.device)
+        distance = (far.square().mean(dim=1) * known).mean()
+        return torch.as_tensor(actions + plan.distillation * distance)
+
+    def watch() -> str:
+        return score_phrases(model, contract, prompts, held_out)
+
+    steps = Steps(plan.steps, plan.batch, plan.learning_rate)
+    parts = [model.model.language_model, head]
+    train_steps("words", parts, task.lengths, loss_of, steps, seed, watch=watch)
+
+
+def teach(
+    teacher: Teacher,
+    prompts: PromptBuilder,
+    phrases: list[Sample],
+    held_out: list[Sample],
+    plan: WordsPlan,
+    seed: int,
+) -> Lessons:
+    """Fine-tune the teacher on the phrases, let it judge reworded ones, gather all lessons.
+
+    A written sentence and its variations share one vector; what the grammar grew has none.
+    """
+    rewording = rewording_of(teacher, prompts)  # before the teacher's word vectors change
+    plain = [sample for sample in phrases if not sample.memories]
+
+    def watch() -> str:
+        best = teacher.listen([s.instruction for s in held_out], "held out").styles.argmax(1)
+        right = [STYLES[i] == s.style for i, s in zip(best.tolist(), held_out, strict=True)]
+        return f"style={np.mean(right):.3f}"
+
+    written = [sample for sample in plain if not sample.phrase_id.startswith("grammar/")]
+    texts, styles = [s.instruction for s in written], [s.style for s in written]
+    teacher.learn_styles(texts, styles, plan.teacher, seed, watch)
+
+    wordings: dict[str, str] = {}
+    for sample in written:
+        wordings.setdefault(sample.phrase_id, sample.instruction)
+    rng = np.random.default_rng([seed, 1])
+    reworded = [
+        replace(sample, instruction=rewording(sample.instruction, rng), phrase_id=REWORDED)
+        for sample in (plain[int(i)] for i in rng.integers(len(plain), size=plan.rewordings))
+    ]
+    heard = teacher.listen([*wordings.values(), *(s.instruction for s in reworded)], "teacher")
+    vectors = (heard.vectors - heard.vectors.mean(0)) / heard.vectors.std()
+    row_of = {phrase_id: row for row, phrase_id in enumerate(wordings)}
+    rows = [row_of.get(sample.phrase_id, -1) for sample in phrases]
+    rows += range(len(wordings), len(vectors))
+    own = torch.tensor(rows)
+    return Lessons(
+        samples=[*phrases, *reworded],
+        vectors=vectors[own],
+        has_vector=(own >= 0).float(),
+        opinions=heard.styles[own],
+        has_opinion=torch.arange(len(own)) >= len(phrases),
+    )
+
+
+def rewording_of(teacher: Teacher, prompts: PromptBuilder) -> Rewording:
+    """Exchanges among the words that both the teacher and the tokenizer hold whole."""
+    pieces = sorted(p for p in prompts.tokenizer.get_vocab() if p in teacher.word_pieces)
+    return Rewording(pieces, teacher.word_vectors(pieces, 256))
+
+
+def bins_by_style(samples: Sequence[Sample], codec: MatrixCodec) -> Tensor:
+    """The soft labels of each style without memories, averaged: [3, 6, 256]."""
+    counts = torch.zeros(len(STYLES), NUM_PARAMETERS, NUM_BINS)
+    for sample in samples:
+        if not sample.memories:
+            bins = torch.tensor(codec.encode(sample.matrix))
+            counts[STYLES.index(sample.style), torch.arange(NUM_PARAMETERS), bins] += 1
+    counts /= counts.sum(dim=2, keepdim=True).clamp(min=1)
+    return counts @ soft_bins(torch.arange(NUM_BINS))
+
+
+def words_only(sample: Sample, prompts: PromptBuilder) -> Example:
+    """Memories and instruction up to the queries, without image and answer text."""
+    return without_answer(tokenize(sample, prompts, image=False))
+
+
+def text_length(sample: Sample) -> int:
+    """Characters of the prompt's own part: good enough to batch by."""
+    past = sum(len(m.instruction) + len(m.scene) + len(m.feedback) + 60 for m in sample.memories)
+    return len(sample.instruction) + past
+
+
+def drop_words(
+    batch: Batch, prompts: PromptBuilder, share: float, rng: np.random.Generator
+) -> Batch:
+    """Replace a share of the ordinary words before the answer by [UNK]: no word is decisive."""
+    unknown, first_special = prompts.ids.unknown, prompts.tokenizer.token_to_id("<|endoftext|>")
+    assert unknown is not None and first_special is not None, "the tiny tokenizer has both"
+    ids = batch.ids.clone()
+    drawn = torch.from_numpy(rng.random(ids.shape)) < share
+    prompt_end = torch.zeros(ids.shape[0], dtype=torch.long)
+    prompt_end[batch.query_rows] = batch.queries[:, 0]
+    before = torch.arange(ids.shape[1])[None, :] < prompt_end[:, None]
+    ids[drawn & before & (ids > unknown) & (ids < first_special)] = unknown
+    return replace(batch, ids=ids)
