@@ -17,6 +17,9 @@ from ridetune.matrix import NUM_PARAMETERS, PARAMETERS, ControllerMatrix, Ranges
 NUM_BINS = 256
 # Where the scale turns from linear to logarithmic, per parameter in the order of PARAMETERS.
 KNEES = (0.05, 0.001, 0.1, 0.02, 1.0, 0.05)
+# The exponent of a distribution before its median is read: a belief of 45 % in one style and 55 %
+# in two others should not come out between them. docs/experiments.md has what others gave.
+SHARPNESS = 1.5
 # A matrix that went through float32 may miss a bound by its last digit.
 ROUNDING = 1e-6
 
@@ -64,17 +67,16 @@ class MatrixCodec:
         return ControllerMatrix.of([self.value(b / (NUM_BINS - 1), i) for i, b in enumerate(bins)])
 
     def expect(self, logits: NDArray[np.float32]) -> tuple[ControllerMatrix, tuple[float, ...]]:
-        """The median level of each parameter's distribution, and its confidence.
+        """The median level of each parameter's sharpened distribution, and its confidence.
 
         logits: [6, 256]. The median keeps to the middle of the style that the model believes in,
         where the highest single bin would follow the noise of the labels; unlike the mean it does
         not fall between two styles. Confidence: probability within +-10 % of the envelope.
         """
         shifted = logits.astype(np.float64) - logits.max(axis=1, keepdims=True)
-        mass = np.exp(shifted)
-        mass /= mass.sum(axis=1, keepdims=True)
-        below = np.cumsum(mass, axis=1)
-        bins = [_median(below[i], mass[i]) for i in range(NUM_PARAMETERS)]
+        mass, sharp = _normal(np.exp(shifted)), _normal(np.exp(SHARPNESS * shifted))
+        below = np.cumsum(sharp, axis=1)
+        bins = [_median(below[i], sharp[i]) for i in range(NUM_PARAMETERS)]
         levels = np.arange(NUM_BINS)
         near = [np.abs(levels - b) <= 0.1 * NUM_BINS for b in bins]
         confidence = tuple(float(mass[i][near[i]].sum()) for i in range(NUM_PARAMETERS))
@@ -93,6 +95,11 @@ class MatrixCodec:
 
 def _warp(value: float, parameter: int) -> float:
     return math.log1p(value / KNEES[parameter])
+
+
+def _normal(mass: NDArray[np.float64]) -> NDArray[np.float64]:
+    shares: NDArray[np.float64] = mass / mass.sum(axis=1, keepdims=True)
+    return shares
 
 
 def _median(below: NDArray[np.float64], mass: NDArray[np.float64]) -> float:

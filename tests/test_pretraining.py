@@ -184,13 +184,12 @@ def test_words_train_the_language_model_and_pictures_the_vision_tower(
     assert changed(visual, state(model, "visual"))
 
 
-def test_word_embeddings_start_from_the_teacher_and_stay(teacher: Teacher) -> None:
+def test_word_embeddings_start_from_the_teacher(teacher: Teacher) -> None:
     prompts = small_prompts()
     torch.manual_seed(0)
     model: Any = build_model(SHAPE, prompts.tokenizer)
     train.tiny.start_embeddings(model, prompts, teacher)
-    weight = model.get_input_embeddings().weight
-    table = weight.detach()
+    table = model.get_input_embeddings().weight.detach()
     vocabulary = prompts.tokenizer.get_vocab()
     pieces = sorted(p for p in vocabulary if p in teacher.word_pieces)
     expected = torch.from_numpy(teacher.word_vectors(pieces, SHAPE.hidden))
@@ -199,9 +198,6 @@ def test_word_embeddings_start_from_the_teacher_and_stay(teacher: Teacher) -> No
     actions = table[list(prompts.ids.actions)]
     steps = (actions[1:] - actions[:-1]).norm(dim=1)
     assert steps.max() < 0.2 * (actions[0] - actions[128]).norm()  # neighbours start near
-    weight.square().sum().backward()
-    assert not weight.grad[rows].any()
-    assert bool(weight.grad[list(prompts.ids.actions)].any(dim=1).all())
 
 
 def test_variations_share_the_teachers_vector_and_only_reworded_ones_its_opinion(

@@ -36,11 +36,16 @@ def batch_loss(
     token_ids: TokenIds,
     *,
     text_weight: float,
+    fixed_vocabulary: bool = False,
 ) -> tuple[Loss, Tensor]:
-    """One forward pass: the losses and the last hidden states [sample, token, hidden]."""
+    """One forward pass: the losses and the last hidden states [sample, token, hidden].
+
+    fixed_vocabulary: no gradient from the text to the output table. Where it is tied to the word
+    embeddings, an answer would push the embedding of every word that it does not hold.
+    """
     hidden = run_tokens(model, batch.ids, batch.positions, features, token_ids)
     actions = _action_loss(model, batch, hidden, token_ids)
-    text = _text_loss(model, batch, hidden)
+    text = _text_loss(model, batch, hidden, fixed_vocabulary)
     return Loss(actions, text, actions + text_weight * text), hidden
 
 
@@ -52,12 +57,13 @@ def _action_loss(model: Any, batch: Batch, hidden: Tensor, token_ids: TokenIds) 
     return F.cross_entropy(logits.flatten(0, 1), soft_bins(batch.bins).flatten(0, 1))
 
 
-def _text_loss(model: Any, batch: Batch, hidden: Tensor) -> Tensor:
+def _text_loss(model: Any, batch: Batch, hidden: Tensor, fixed_vocabulary: bool) -> Tensor:
     if len(batch.text_rows) == 0:
         return hidden.new_zeros(())
     before = hidden[batch.text_rows, batch.text_at]  # [targets, hidden]
-    logits = model.get_output_embeddings()(before).float()
-    return F.cross_entropy(logits, batch.text_ids)
+    table = model.get_output_embeddings()
+    logits = F.linear(before, table.weight.detach()) if fixed_vocabulary else table(before)
+    return F.cross_entropy(logits.float(), batch.text_ids)
 
 
 def soft_bins(bins: Tensor) -> Tensor:

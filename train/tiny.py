@@ -96,11 +96,7 @@ def pretrain(config: TinyConfig) -> None:
 
 
 def start_embeddings(model: Any, prompts: PromptBuilder, teacher: Teacher) -> None:
-    """Word embeddings from the teacher; neighbouring action tokens start near each other.
-
-    The teacher's words stay where they are: a word that training holds once would otherwise move
-    to fit its sentence, and words that it never holds would be left behind.
-    """
+    """Word embeddings from the teacher; neighbouring action tokens start near each other."""
     table = model.get_input_embeddings().weight
     vocabulary = prompts.tokenizer.get_vocab()
     pieces = sorted(p for p in vocabulary if p in teacher.word_pieces)
@@ -112,7 +108,6 @@ def start_embeddings(model: Any, prompts: PromptBuilder, teacher: Teacher) -> No
         level = torch.linspace(0, 1, len(ACTION_TOKENS))[:, None]
         waves = level * torch.randn(1, table.shape[1]) * 6 + torch.rand(1, table.shape[1]) * 6.3
         table[list(prompts.ids.actions)] = torch.cos(waves) * EMBEDDING_SCALE
-    table.register_hook(lambda gradient: gradient.index_fill(0, rows.to(gradient.device), 0.0))
 
 
 def learn_pictures(
@@ -170,7 +165,10 @@ def learn_both(
             for i, text in zip(chosen, as_text, strict=True)
         ]
         batch = drop_words(collate(rows), prompts, config.word_dropout, rng).to(model.device)
-        loss, _ = batch_loss(model, batch, features, prompts.ids, text_weight=config.text_weight)
+        weight = config.text_weight
+        loss, _ = batch_loss(
+            model, batch, features, prompts.ids, text_weight=weight, fixed_vocabulary=True
+        )
         return loss.total
 
     def watch() -> str:

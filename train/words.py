@@ -96,7 +96,9 @@ class WordsTask:
         samples = [self._lessons.samples[i] for i in rows]
         examples = [tokenize(s, self._prompts, image=False, as_text=True) for s in samples]
         batch = collate(examples).to(self._model.device)
-        return batch_loss(self._model, batch, None, self._prompts.ids, text_weight=1.0)[0].total
+        ids = self._prompts.ids
+        loss, _ = batch_loss(self._model, batch, None, ids, text_weight=1.0, fixed_vocabulary=True)
+        return loss.total
 
 
 def learn_words(
@@ -141,8 +143,10 @@ def teach(
 ) -> Lessons:
     """Fine-tune the teacher on the phrases, let it judge reworded ones, gather all lessons.
 
-    A written sentence and its variations share one vector; what the grammar grew has none.
+    Rows with memories are three times as long, so only every second of them takes part. A written
+    sentence and its variations share one vector; what the grammar grew has none.
     """
+    phrases = [sample for i, sample in enumerate(phrases) if not sample.memories or i % 2]
     rewording = rewording_of(teacher, prompts)  # before the teacher's word vectors change
     plain = [sample for sample in phrases if not sample.memories]
 
