@@ -43,6 +43,7 @@ CONFIGS = {
     "serve.yaml": ("serve.app", "ServeConfig"),
     "tiny.yaml": ("train.tiny", "TinyConfig"),
     "train.yaml": ("train.sft", "TrainConfig"),
+    "vehicle.yaml": ("ridetune.control.vehicle", "Vehicle"),
 }
 
 

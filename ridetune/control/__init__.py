@@ -1,0 +1,1 @@
+"""Controllers: waypoints, speeds and a controller matrix -> steering angle and acceleration."""

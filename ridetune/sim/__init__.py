@@ -1,0 +1,1 @@
+"""Closed-loop simulation: scenarios, vehicles, trajectories and what they are worth."""
