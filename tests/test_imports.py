@@ -37,6 +37,7 @@ CONFIGS = {
     "data.yaml": ("data.build", "DataConfig"),
     "data-pretrain.yaml": ("data.build", "DataConfig"),
     "demo.yaml": ("serve.demo", "DemoConfig"),
+    "driving_score.yaml": ("evaluate.driving_score", "DrivingScoreConfig"),
     "evaluate.yaml": ("evaluate.report", "EvaluateConfig"),
     "export.yaml": ("quantize.export", "ExportConfig"),
     "quantize.yaml": ("quantize.build", "QuantizeConfig"),
