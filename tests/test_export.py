@@ -88,15 +88,24 @@ def _unpack_node(inputs: list[NDArray[np.uint8]]) -> GroupedLevels:
     return GroupedLevels(split, halves[:, : scales.shape[1]], scales.astype(np.float16))
 
 
-def test_int8_activations_keep_the_decisions_near(tmp_path: Path) -> None:
+def test_int8_activations_move_little_of_the_probability(tmp_path: Path) -> None:
     bundle = load_bundle(copy_of_bundle(tmp_path))
     prompts = parity_prompts(export_config(awq_model(), "unused"), bundle.contract)
     exact = answers(OrtEngine(bundle), prompts, name="level 0")
     set_accuracy_level(bundle.folder / DECODER_FILE, 4)
     deployed = answers(OrtEngine(bundle), prompts, name="level 4")
-    assert not np.array_equal(exact[0].logits, deployed[0].logits)
+    one, other = (shares(np.stack([a.logits for a in some])) for some in (exact, deployed))
+    moved = np.abs(one - other).sum(axis=-1) / 2  # [prompt, parameter]
+    assert 0 < moved.min() <= moved.max() < 0.05
     figures = compare_decisions(exact, deployed, bundle.contract.codec)
-    assert 0 < figures["bins_mean"] <= figures["bins_max"] < 20
+    assert 0 < figures["bins_mean"] < figures["bins_max"]
+
+
+def shares(logits: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Probabilities over the bins."""
+    mass = np.exp(logits - logits.max(axis=-1, keepdims=True), dtype=float)
+    whole: NDArray[np.float64] = mass / mass.sum(axis=-1, keepdims=True)
+    return whole
 
 
 class Flat(OrtEngine):
