@@ -1,43 +1,35 @@
-"""The closed loop: physics, scenarios, a failing policy, and what the fast loop leaves out."""
+"""The closed loop: physics, scenarios, and what the fast loop leaves out."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ridetune.codec import MatrixCodec
 from ridetune.control.kernel import Numbers
-from ridetune.control.mpc import NUM_GAINS, BicycleModel, preview_gains, yaw_gain
+from ridetune.control.mpc import NUM_GAINS, BicycleModel, preview_gains
 from ridetune.control.path import Path as DrivePath
 from ridetune.control.tracker import PERIOD_S, Measurement, Tracker
 from ridetune.control.vehicle import Sensors, Vehicle
-from ridetune.gate import SafetyGate
-from ridetune.matrix import STYLES, ControllerMatrix, Ranges, Style
+from ridetune.matrix import STYLES, ControllerMatrix, Style
 from ridetune.sample import CONDITIONS, Condition
-from ridetune.sim.drive import Answer, MatrixSource, Moment, PolicyDrive, drive_policy
 from ridetune.sim.loop import BIN_MPS, LANE_MARGIN_M
 from ridetune.sim.metrics import measure
 from ridetune.sim.plant import (
-    ACCELERATION,
     HEADING,
     NOMINAL,
     NUM_CELLS,
     SPEED,
     STEER,
-    YAW_RATE,
     Plant,
     Spread,
     X,
     Y,
     draw_spread,
     move,
-    slide,
 )
 from ridetune.sim.road import AT_SPEED, lay_out
-from ridetune.sim.rollout import Rollout, rollout, rollout_batch
+from ridetune.sim.rollout import rollout, rollout_batch
 from ridetune.sim.scenarios import (
     ACCELERATION as ACCELERATING,
 )
@@ -48,30 +40,15 @@ from ridetune.sim.scenarios import (
     MANOEUVRES,
     PEDESTRIAN,
     SCENARIOS,
-    STATIC_OBSTACLE,
     TRAFFIC_LIGHT,
     Actor,
     Scenario,
     Straight,
 )
+from tests.shipped_car import DEFAULT, RANGES, VEHICLE, middle, run
 
-VEHICLE = Vehicle.load(Path("configs/vehicle.yaml"))
 QUIET = replace(VEHICLE, sensors=Sensors(0.0, 0.0, 0.0, 0.0))
-RANGES = Ranges.load(Path("configs/ranges.yaml"))
-GATE = SafetyGate(RANGES, MatrixCodec(RANGES))
-DEFAULT = RANGES.default
 FREE_STEP = replace(ACCELERATING, actors=(), drive_off_s=0.0)
-
-
-def middle(style: Style) -> ControllerMatrix:
-    """The middle of each parameter's full-score range."""
-    return ControllerMatrix.of([(r.lower + r.upper) / 2 for r in RANGES.styles[style]])
-
-
-def run(
-    matrix: ControllerMatrix, scenario: Scenario, condition: Condition = "sunny", seed: int = 0
-) -> Rollout:
-    return rollout(matrix, scenario, condition, vehicle=VEHICLE, seed=seed)
 
 
 # --- the same run again ---
@@ -155,74 +132,6 @@ def test_the_default_accelerates_like_the_baseline_of_the_paper() -> None:
     runs = [measure(run(DEFAULT, ACCELERATING, c).trajectory) for c in CONDITIONS]
     assert np.mean([m.sv_x for m in runs]) == pytest.approx(28.8, rel=0.15)
     assert np.mean([m.mean_ax for m in runs]) == pytest.approx(0.78, rel=0.15)
-
-
-# --- the plant ---
-
-
-def turned(plant: Plant, speed: float, steer: float, seconds: float = 6.0) -> Numbers:
-    """The plant's state after a constant steering command at a held speed."""
-    state, steps = np.zeros(NUM_CELLS), round(seconds / PERIOD_S)
-    state[SPEED] = speed
-    steers, pulls = np.full(steps, steer), np.zeros(steps)
-    for k in range(steps):
-        move(plant, state, steers, pulls, k, PERIOD_S)
-    return state
-
-
-@pytest.mark.parametrize("speed", [1.0, 5.0, 8.0, 14.0])
-def test_a_steady_turn_has_the_yaw_rate_of_the_bicycle_model(speed: float) -> None:
-    state = turned(Plant.of(VEHICLE, NOMINAL, 5.0, PERIOD_S), speed, 0.02)
-    model = BicycleModel.of(VEHICLE)
-    rolling = speed / model.wheelbase_m if speed < 1.5 else yaw_gain(model, speed)
-    assert state[YAW_RATE] == pytest.approx(0.02 * rolling, rel=0.02)
-
-
-@pytest.mark.parametrize("friction", [0.35, 0.6, 0.9])
-def test_friction_bounds_what_the_tyres_give_and_braking_takes_its_share(friction: float) -> None:
-    plant, rng = Plant.of(VEHICLE, NOMINAL, friction, PERIOD_S), np.random.default_rng(2)
-    most = friction * 9.81
-    for _ in range(300):
-        lateral, yaw_rate, steer = (
-            rng.uniform(-3.0, 3.0),
-            rng.uniform(-1, 1),
-            rng.uniform(-0.5, 0.5),
-        )
-        sliding, _ = slide(plant, 14.0, lateral, yaw_rate, steer, 0.0)
-        assert abs(sliding + 14.0 * yaw_rate) <= most * (1.0 + 1e-9)
-        braked, _ = slide(plant, 14.0, lateral, yaw_rate, steer, -0.8 * most)
-        assert abs(braked + 14.0 * yaw_rate) <= 0.6 * most * (1.0 + 1e-9)
-    saturated, _ = slide(plant, 14.0, 0.0, 0.0, 0.5, 0.0)
-    assert saturated == pytest.approx(most * plant.rear_m / VEHICLE.body.wheelbase_m)
-
-
-def test_worn_tyres_and_a_heavy_load_turn_less() -> None:
-    nominal = turned(Plant.of(VEHICLE, NOMINAL, 0.9, PERIOD_S), 14.0, 0.05)[YAW_RATE]
-    worn = turned(Plant.of(VEHICLE, Spread(tyres=0.7), 0.9, PERIOD_S), 14.0, 0.05)[YAW_RATE]
-    heavy = turned(Plant.of(VEHICLE, Spread(mass=1.2), 0.9, PERIOD_S), 14.0, 0.05)[YAW_RATE]
-    assert worn < nominal and heavy < nominal
-
-
-def test_a_standing_car_neither_moves_nor_turns_and_never_rolls_back() -> None:
-    plant, state = Plant.of(VEHICLE, NOMINAL, 0.9, PERIOD_S), np.zeros(NUM_CELLS)
-    steers, pulls = np.full(100, 0.3), np.full(100, -2.0)
-    for k in range(100):
-        move(plant, state, steers, pulls, k, PERIOD_S)
-    assert state[X] == state[Y] == state[HEADING] == state[SPEED] == state[ACCELERATION] == 0.0
-    assert state[STEER] == pytest.approx(0.3, rel=0.01)
-
-
-def test_a_command_acts_after_its_delay_and_with_its_lag() -> None:
-    plant = Plant.of(VEHICLE, Spread(acceleration_delay_s=0.12, mass=1.25), 0.9, PERIOD_S)
-    state, accelerations = np.zeros(NUM_CELLS), []
-    state[SPEED] = 10.0
-    for k in range(60):
-        move(plant, state, np.zeros(60), np.ones(60), k, PERIOD_S)
-        accelerations.append(state[ACCELERATION])
-    assert accelerations[3] == 0.0  # 0.12 s
-    after = 0.3
-    expected = (1.0 - math.exp(-after / 0.2)) / 1.25
-    assert accelerations[round((0.12 + after) / PERIOD_S) - 1] == pytest.approx(expected, rel=1e-6)
 
 
 # --- scenarios and conditions ---
@@ -430,94 +339,3 @@ def test_gains_between_two_speeds_are_nearly_the_exact_ones() -> None:
                 off = np.abs(0.5 * (low + high) - exact)[:3] / np.abs(exact[:3])
                 worst = max(worst, float(off.max()))
     assert worst < 0.03
-
-
-# --- a policy in the loop ---
-
-
-def with_policy(source: MatrixSource, scenario: Scenario = LANE_CHANGE) -> PolicyDrive:
-    return drive_policy(source, scenario, vehicle=VEHICLE, gate=GATE, default=DEFAULT)
-
-
-def test_a_policy_that_says_the_default_drives_like_the_default() -> None:
-    driven = with_policy(lambda _: Answer(DEFAULT))
-    expected = run(DEFAULT, LANE_CHANGE).trajectory.signals
-    np.testing.assert_array_equal(driven.rollout.trajectory.signals, expected)
-    assert driven.questions == len(driven.changes) == 19
-    assert driven.stopping_s == 0.0
-
-
-def test_proposals_pass_the_gate_and_swap_without_a_jump() -> None:
-    styles = [middle("aggressive"), middle("conservative")]
-    driven = with_policy(lambda moment: Answer(styles[round(moment.time_s) % 2]))
-    assert "limited" in {change.outcome for change in driven.changes}
-    assert len({change.matrix for change in driven.changes}) > 1
-    signals = driven.rollout.trajectory
-    assert driven.rollout.status == "finished"
-    jerk = np.diff(signals["acceleration_mps2"]) / PERIOD_S
-    assert np.abs(jerk).max() <= VEHICLE.limits.jerk_mps3 + 1e-9
-    rate = np.diff(signals["steer_rad"]) / PERIOD_S
-    assert np.abs(rate).max() <= VEHICLE.limits.steer_rate_radps + 1e-9
-
-
-def raising(moment: Moment) -> Answer:
-    raise RuntimeError("the model is gone")
-
-
-FAILURES: dict[str, Callable[[Moment], Answer | None]] = {
-    "never": lambda _: None,
-    "raises": raising,
-    "nan": lambda _: Answer([[math.nan] * 3, [math.nan] * 3]),
-    "no matrix": lambda _: Answer("drive carefully"),
-    "outside": lambda _: Answer(ControllerMatrix(50.0, 0.0, 0.0, 0.1, 1.0, 0.3)),
-    "too late": lambda _: Answer(DEFAULT, latency_s=3.5),
-    "latency nan": lambda _: Answer(DEFAULT, latency_s=math.nan),
-}
-
-
-@pytest.mark.parametrize("scenario", MANOEUVRES, ids=lambda s: s.name)
-@pytest.mark.parametrize("failure", sorted(FAILURES))
-def test_a_failing_policy_leaves_the_last_matrix_and_the_car_stops_in_its_lane(
-    failure: str, scenario: Scenario
-) -> None:
-    driven = with_policy(FAILURES[failure], scenario)
-    assert driven.rollout.status == "stopped"
-    assert {change.matrix for change in driven.changes} <= {DEFAULT}
-    assert {change.outcome for change in driven.changes} <= {"refused"}
-    signals = driven.rollout.trajectory
-    assert np.abs(signals["lateral_error_m"]).max() < 0.5
-    assert signals["acceleration_mps2"].min() > -3.0
-    patient = signals["speed_mps"][signals.time_s < 3.0]
-    assert patient[-1] > 0.8 * scenario.initial_mps
-
-
-def test_a_policy_that_is_late_but_not_too_late_is_heard_late() -> None:
-    driven = with_policy(lambda _: Answer(middle("moderate"), latency_s=2.0))
-    assert driven.rollout.status == "finished" and driven.stopping_s == 0.0
-    assert driven.changes[0].time_s == pytest.approx(2.01, abs=PERIOD_S)
-    # One question at a time: the next one waits for the answer.
-    assert driven.questions <= 7
-
-
-def test_a_policy_that_comes_back_lets_the_car_drive_on() -> None:
-    driven = with_policy(lambda moment: Answer(DEFAULT) if moment.time_s > 8.0 else None)
-    speed = driven.rollout.trajectory["speed_mps"]
-    assert driven.stopping_s == pytest.approx(5.0, abs=1.1)
-    assert speed.min() < 0.6 * LANE_CHANGE.initial_mps
-    assert speed[-1] > 0.8 * LANE_CHANGE.target_mps
-
-
-def test_the_source_sees_the_road_as_it_is() -> None:
-    seen: list[Moment] = []
-
-    def source(moment: Moment) -> Answer:
-        seen.append(moment)
-        return Answer(DEFAULT)
-
-    driven = with_policy(source, STATIC_OBSTACLE)
-    assert [round(moment.time_s) for moment in seen] == list(range(19))
-    assert seen[0].speed_mps == STATIC_OBSTACLE.initial_mps
-    assert len(seen[0].actors) == len(STATIC_OBSTACLE.actors)
-    assert seen[0].actors[0] == pytest.approx((VEHICLE.body.nose_m + 30.3, -0.4))
-    k = round(seen[5].time_s / PERIOD_S)
-    assert seen[5].x_m == driven.rollout.trajectory["x_m"][k]
