@@ -10,9 +10,7 @@ import numpy as np
 from ridetune.alignment import CONSERVATIVE_SIGN
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import ControllerMatrix, Style, ki_limit
-from ridetune.sample import Condition
-
-from .instructions import FeedbackKind
+from ridetune.sample import Condition, FeedbackKind
 
 CLEAR_POSITION = 0.65
 CONDITION_SHIFT: dict[Condition, float] = {

@@ -20,11 +20,19 @@ from tqdm import tqdm
 from ridetune.codec import MatrixCodec
 from ridetune.config import save_config
 from ridetune.matrix import STYLES, Ranges, Style
-from ridetune.sample import CONDITIONS, Memory, Observation, Sample, Split
+from ridetune.sample import (
+    CONDITIONS,
+    FEEDBACK_KINDS,
+    FeedbackKind,
+    Memory,
+    Observation,
+    Sample,
+    Split,
+)
 from ridetune.stage import Stopwatch, new_folder, write_manifest
 
 from .annotate import draw_matrix, explain
-from .instructions import FEEDBACK_KINDS, Bank, FeedbackKind, Phrase, load_bank, pick, vary
+from .instructions import Bank, Phrase, load_bank, pick, vary
 from .scene import Scene, describe, sample_scene, with_condition
 from .synthetic import render
 

@@ -12,14 +12,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from ridetune.matrix import STYLES, Style
-from ridetune.sample import LEVELS, Level, Split
+from ridetune.sample import LEVELS, FeedbackKind, Level, Split
 
 BANK = Path(__file__).parent / "bank"
 HELD_OUT_SENTENCES = 0.15
@@ -28,9 +28,6 @@ HELD_OUT_FEEDBACK = 0.2
 NEAR_REPEAT = 0.7  # Jaccard similarity of the word sets
 
 T = TypeVar("T")
-
-FeedbackKind = Literal["too_aggressive", "too_conservative", "just_right"]
-FEEDBACK_KINDS: tuple[FeedbackKind, ...] = ("too_aggressive", "too_conservative", "just_right")
 
 OPENERS = ("Um, ", "Hey car, ", "Listen, ", "Well, ", "So, ", "Okay, ")
 CLOSERS = (", please.", ", thanks.", ", okay?", " now.")

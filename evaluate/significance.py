@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-# Bisection steps: a share in [0, 1] to within 1e-15.
+# Bisection steps: what is sought in [0, 1] to within 1e-15.
 _STEPS = 50
 # Two tables are equally likely if their probabilities differ by rounding alone.
 _ROUNDING = 1e-7
@@ -19,8 +19,8 @@ def clopper_pearson(events: int, trials: int, confidence: float = 0.95) -> tuple
     if not 0 <= events <= trials or trials < 1:
         raise ValueError(f"{events} events in {trials} trials are impossible")
     tail = (1.0 - confidence) / 2.0
-    low = 0.0 if events == 0 else _solve(lambda p: 1 - _at_most(events - 1, trials, p), tail)
-    high = 1.0 if events == trials else _solve(lambda p: 1 - _at_most(events, trials, p), 1 - tail)
+    low = 0.0 if events == 0 else solve(lambda p: 1 - _at_most(events - 1, trials, p), tail)
+    high = 1.0 if events == trials else solve(lambda p: 1 - _at_most(events, trials, p), 1 - tail)
     return low, high
 
 
@@ -59,9 +59,10 @@ def _at_most(events: int, trials: int, share: float) -> float:
     )
 
 
-def _solve(rising: Callable[[float], float], target: float) -> float:
-    """Where a rising function on [0, 1] meets the target, by bisection."""
-    low, high = 0.0, 1.0
+def solve(
+    rising: Callable[[float], float], target: float, *, low: float = 0.0, high: float = 1.0
+) -> float:
+    """Where a rising function on [low, high] meets the target, by bisection."""
     for _ in range(_STEPS):
         middle = (low + high) / 2.0
         low, high = (middle, high) if rising(middle) < target else (low, middle)

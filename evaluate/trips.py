@@ -13,12 +13,10 @@ import numpy as np
 
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import STYLES, ControllerMatrix, Style
-from ridetune.sample import LEVELS, Condition, Level
+from ridetune.sample import FEEDBACK_KINDS, LEVELS, Condition, FeedbackKind, Level
 from ridetune.sim.metrics import DriveMetrics, measure
 from ridetune.sim.passengers import (
-    FEEDBACK_KINDS,
     Expectation,
-    FeedbackKind,
     Impression,
     Passenger,
     Priors,
@@ -28,6 +26,8 @@ from ridetune.sim.passengers import (
     takeover_probability,
 )
 from ridetune.sim.trajectory import Trajectory
+
+from .significance import solve
 
 Scenario = TypeVar("Scenario")
 # matrix, scenario, seed -> the closed-loop drive
@@ -203,16 +203,13 @@ def _calibrate(world: World[Scenario]) -> float:
             np.mean([takeover_probability(i, p, tolerance, world.priors) for i, p in rides])
         )
 
-    low, high = 0.0, _MOST_TOLERANT
-    if not rate(high) <= target <= rate(low):
+    lowest, highest = rate(_MOST_TOLERANT), rate(0.0)
+    if not lowest <= target <= highest:
         raise ValueError(
             f"no tolerance makes the baseline's takeover rate {target:.3f}; it lies between "
-            f"{rate(high):.3f} and {rate(low):.3f} in these settings"
+            f"{lowest:.3f} and {highest:.3f} in these settings"
         )
-    for _ in range(50):
-        middle = (low + high) / 2.0
-        low, high = (middle, high) if rate(middle) > target else (low, middle)
-    return (low + high) / 2.0
+    return solve(lambda tolerance: -rate(tolerance), -target, high=_MOST_TOLERANT)
 
 
 def _check_sentences(sentences: Sentences) -> None:

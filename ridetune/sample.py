@@ -17,6 +17,8 @@ ADVERSE: tuple[Condition, ...] = ("rain", "fog", "snow", "night")
 
 Level = Literal["I", "II", "III"]
 LEVELS: tuple[Level, ...] = get_args(Level)
+FeedbackKind = Literal["too_aggressive", "too_conservative", "just_right"]
+FEEDBACK_KINDS: tuple[FeedbackKind, ...] = ("too_aggressive", "too_conservative", "just_right")
 
 Split = Literal["train", "calibration", "test"]
 

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from data.build import draw_instruction
-from data.instructions import FEEDBACK_KINDS, NEAR_REPEAT, Bank, Phrase, load_bank, vary
+from data.instructions import NEAR_REPEAT, Bank, Phrase, load_bank, vary
 from ridetune.matrix import STYLES
 from ridetune.prompt import MAX_INSTRUCTION_CHARACTERS, clean_instruction
-from ridetune.sample import LEVELS
+from ridetune.sample import FEEDBACK_KINDS, LEVELS
 
 
 def _words(text: str) -> frozenset[str]:

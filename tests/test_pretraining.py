@@ -172,9 +172,10 @@ def test_words_train_the_language_model_and_pictures_the_vision_tower(
     samples: list[Sample] = list(small_samples())
     language, visual = state(model, "language_model"), state(model, "visual")
 
-    lessons = teach(teacher, prompts, phrases, phrases[:3], config.words, seed=0)
+    rewording = Rewording(*teacher.words_of(prompts.tokenizer, SHAPE.hidden))
+    lessons = teach(teacher, rewording, phrases, phrases[:3], config.words, seed=0)
     task = WordsTask(model, contract, prompts, lessons, word_dropout=0.1)
-    learn_words(model, contract, prompts, task, lessons, phrases[:3], config.words, seed=0)
+    learn_words(task, phrases[:3], config.words, seed=0)
     assert changed(language, state(model, "language_model"))
     assert not changed(visual, state(model, "visual"))
 
@@ -188,7 +189,8 @@ def test_word_embeddings_start_from_the_teacher(teacher: Teacher) -> None:
     prompts = small_prompts()
     torch.manual_seed(0)
     model: Any = build_model(SHAPE, prompts.tokenizer)
-    train.tiny.start_embeddings(model, prompts, teacher)
+    words = teacher.words_of(prompts.tokenizer, SHAPE.hidden)
+    train.tiny.start_embeddings(model, prompts, *words)
     table = model.get_input_embeddings().weight.detach()
     vocabulary = prompts.tokenizer.get_vocab()
     pieces = sorted(p for p in vocabulary if p in teacher.word_pieces)
@@ -210,7 +212,8 @@ def test_variations_share_the_teachers_vector_and_only_reworded_ones_its_opinion
         for number, name in enumerate(ids)
     ]
     plan = replace(tiny_config(tmp_path).words, rewordings=3)
-    lessons = teach(teacher, small_prompts(), phrases, phrases, plan, seed=0)
+    rewording = Rewording(*teacher.words_of(small_prompts().tokenizer, SHAPE.hidden))
+    lessons = teach(teacher, rewording, phrases, phrases, plan, seed=0)
     assert len(lessons.samples) == 7
     assert lessons.has_vector.tolist() == [1, 0, 1, 1, 1, 1, 1]
     assert lessons.has_opinion.tolist() == [False] * 4 + [True] * 3

@@ -14,10 +14,9 @@ from evaluate.takeover import ARMS, Count, Study, sensitivity, study
 from evaluate.trips import Sentences, Setting, StudyConfig, World, plan_trips, prepare
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import STYLES, ControllerMatrix, Ranges, Style, ki_limit
-from ridetune.sample import LEVELS, Memory
+from ridetune.sample import FEEDBACK_KINDS, LEVELS, Memory
 from ridetune.sim.metrics import measure
 from ridetune.sim.passengers import (
-    FEEDBACK_KINDS,
     WISHES,
     Impression,
     Passenger,

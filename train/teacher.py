@@ -19,6 +19,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from tokenizers import Tokenizer
 from torch import Tensor, nn
 from tqdm import tqdm
 from transformers import AutoModel, AutoTokenizer
@@ -112,6 +113,14 @@ class Teacher:
         hidden = self.model(**inputs).last_hidden_state  # [text, token, 384]
         mask = inputs["attention_mask"][..., None]
         return torch.as_tensor((hidden * mask).sum(1) / mask.sum(1))
+
+    def words_of(self, tokenizer: Tokenizer, size: int) -> tuple[list[str], NDArray[np.float32]]:
+        """The pieces that a tokenizer shares with the teacher, and their vectors [piece, size].
+
+        To be asked before `learn_styles`, which changes what a single word means to the teacher.
+        """
+        pieces = sorted(p for p in tokenizer.get_vocab() if p in self.word_pieces)
+        return pieces, self.word_vectors(pieces, size)
 
     @torch.no_grad()
     def word_vectors(self, pieces: Sequence[str], size: int) -> NDArray[np.float32]:

@@ -11,6 +11,7 @@ Hugging Face tools read it, in fp16. Trained once and committed as models/tiny.
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from .base import TinyShape, build_model, build_tokenizer, save_tokenizer, visio
 from .collate import collate, tokenize
 from .objective import batch_loss
 from .pixels import Augment, patches_of
+from .reword import Rewording
 from .rows import read_phrases, read_pixels
 from .schedule import Steps, endless_batches, train_steps
 from .score import score_phrases
@@ -75,12 +77,14 @@ def pretrain(config: TinyConfig) -> None:
     tokenizer = build_tokenizer(teacher.word_pieces, _corpus(phrases), config.shape.vocabulary)
     prompts = contract.prompts(tokenizer)
     model = build_model(config.shape, tokenizer)
-    start_embeddings(model, prompts, teacher)
+    pieces, vectors = teacher.words_of(tokenizer, config.shape.hidden)
+    start_embeddings(model, prompts, pieces, vectors)
     model.to(torch.device(config.device))
 
-    lessons = teach(teacher, prompts, phrases, held_out, config.words, config.seed)
+    rewording = Rewording(pieces, vectors)
+    lessons = teach(teacher, rewording, phrases, held_out, config.words, config.seed)
     task = WordsTask(model, contract, prompts, lessons, config.word_dropout)
-    learn_words(model, contract, prompts, task, lessons, held_out, config.words, config.seed)
+    learn_words(task, held_out, config.words, config.seed)
     samples = read_samples(config.data / "train.parquet")
     pixels = read_pixels(samples, contract.vision)
     learn_pictures(model, contract, samples, pixels, config)
@@ -95,16 +99,16 @@ def pretrain(config: TinyConfig) -> None:
     print(f"tiny base: {model.num_parameters()} parameters in {config.out}, {watch.seconds:.0f} s")
 
 
-def start_embeddings(model: Any, prompts: PromptBuilder, teacher: Teacher) -> None:
-    """Word embeddings from the teacher; neighbouring action tokens start near each other."""
+def start_embeddings(
+    model: Any, prompts: PromptBuilder, pieces: Sequence[str], vectors: NDArray[np.float32]
+) -> None:
+    """Word embeddings from vectors [piece, hidden]; neighbouring action tokens start near."""
     table = model.get_input_embeddings().weight
     vocabulary = prompts.tokenizer.get_vocab()
-    pieces = sorted(p for p in vocabulary if p in teacher.word_pieces)
-    rows = torch.tensor([vocabulary[p] for p in pieces])
     with torch.no_grad():
         table.normal_(0, EMBEDDING_SCALE)
-        vectors = torch.from_numpy(teacher.word_vectors(pieces, table.shape[1]))
-        table[rows] = vectors * EMBEDDING_SCALE
+        rows = [vocabulary[p] for p in pieces]
+        table[rows] = torch.from_numpy(vectors) * EMBEDDING_SCALE
         level = torch.linspace(0, 1, len(ACTION_TOKENS))[:, None]
         waves = level * torch.randn(1, table.shape[1]) * 6 + torch.rand(1, table.shape[1]) * 6.3
         table[list(prompts.ids.actions)] = torch.cos(waves) * EMBEDDING_SCALE

@@ -72,46 +72,38 @@ class WordsTask:
         lessons: Lessons,
         word_dropout: float,
     ) -> None:
-        self._model, self._prompts, self._lessons = model, prompts, lessons
+        self.model, self.contract, self.prompts, self.lessons = model, contract, prompts, lessons
         self._word_dropout = word_dropout
         self._of_style = bins_by_style(lessons.samples, contract.codec)
         self.lengths = [text_length(sample) for sample in lessons.samples]
 
     def actions(self, chosen: list[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """Loss of the six bins, and the last hidden state of the last query [sample, hidden]."""
-        lessons, device = self._lessons, self._model.device
-        examples = [words_only(lessons.samples[i], self._prompts) for i in chosen]
-        batch = drop_words(collate(examples), self._prompts, self._word_dropout, rng).to(device)
-        hidden = run_tokens(self._model, batch.ids, batch.positions, None, self._prompts.ids)
+        lessons, device = self.lessons, self.model.device
+        examples = [words_only(lessons.samples[i], self.prompts) for i in chosen]
+        batch = drop_words(collate(examples), self.prompts, self._word_dropout, rng).to(device)
+        hidden = run_tokens(self.model, batch.ids, batch.positions, None, self.prompts.ids)
         at_queries = hidden[batch.query_rows[:, None], batch.queries]
         mixed = torch.einsum("ns,spb->npb", lessons.opinions[chosen], self._of_style).to(device)
         unsure = lessons.has_opinion[chosen].to(device)[:, None, None]
         targets = torch.where(unsure, mixed, soft_bins(batch.bins))
-        logits = action_logits(self._model, at_queries, self._prompts.ids).float()
+        logits = action_logits(self.model, at_queries, self.prompts.ids).float()
         return F.cross_entropy(logits.flatten(0, 1), targets.flatten(0, 1)), at_queries[:, -1]
 
     def text(self, chosen: list[int]) -> Tensor:
         """Loss of the matrix as text; samples without a label of their own are left out."""
-        rows = [i for i in chosen if not self._lessons.has_opinion[i]] or [0]
-        samples = [self._lessons.samples[i] for i in rows]
-        examples = [tokenize(s, self._prompts, image=False, as_text=True) for s in samples]
-        batch = collate(examples).to(self._model.device)
-        ids = self._prompts.ids
-        loss, _ = batch_loss(self._model, batch, None, ids, text_weight=1.0, fixed_vocabulary=True)
+        rows = [i for i in chosen if not self.lessons.has_opinion[i]] or [0]
+        samples = [self.lessons.samples[i] for i in rows]
+        examples = [tokenize(s, self.prompts, image=False, as_text=True) for s in samples]
+        batch = collate(examples).to(self.model.device)
+        ids = self.prompts.ids
+        loss, _ = batch_loss(self.model, batch, None, ids, text_weight=1.0, fixed_vocabulary=True)
         return loss.total
 
 
-def learn_words(
-    model: Any,
-    contract: Contract,
-    prompts: PromptBuilder,
-    task: WordsTask,
-    lessons: Lessons,
-    held_out: list[Sample],
-    plan: WordsPlan,
-    seed: int,
-) -> None:
+def learn_words(task: WordsTask, held_out: list[Sample], plan: WordsPlan, seed: int) -> None:
     """Train the language model on sentences and memories, without images."""
+    model, lessons = task.model, task.lessons
     torch.manual_seed(seed)
     head = nn.Linear(model.config.text_config.hidden_size, lessons.vectors.shape[1])
     head.to(model.device)
@@ -126,7 +118,7 @@ def learn_words(
         return torch.as_tensor(actions + plan.distillation * distance)
 
     def watch() -> str:
-        return score_phrases(model, contract, prompts, held_out)
+        return score_phrases(model, task.contract, task.prompts, held_out)
 
     steps = Steps(plan.steps, plan.batch, plan.learning_rate)
     parts = [model.model.language_model, head]
@@ -135,7 +127,7 @@ def learn_words(
 
 def teach(
     teacher: Teacher,
-    prompts: PromptBuilder,
+    rewording: Rewording,
     phrases: list[Sample],
     held_out: list[Sample],
     plan: WordsPlan,
@@ -147,7 +139,6 @@ def teach(
     sentence and its variations share one vector; what the grammar grew has none.
     """
     phrases = [sample for i, sample in enumerate(phrases) if not sample.memories or i % 2]
-    rewording = rewording_of(teacher, prompts)  # before the teacher's word vectors change
     plain = [sample for sample in phrases if not sample.memories]
 
     def watch() -> str:
@@ -180,12 +171,6 @@ def teach(
         opinions=heard.styles[own],
         has_opinion=torch.arange(len(own)) >= len(phrases),
     )
-
-
-def rewording_of(teacher: Teacher, prompts: PromptBuilder) -> Rewording:
-    """Exchanges among the words that both the teacher and the tokenizer hold whole."""
-    pieces = sorted(p for p in prompts.tokenizer.get_vocab() if p in teacher.word_pieces)
-    return Rewording(pieces, teacher.word_vectors(pieces, 256))
 
 
 def bins_by_style(samples: Sequence[Sample], codec: MatrixCodec) -> Tensor:

@@ -7,7 +7,7 @@ place on it. x forward, y left, headings and curvatures counter-clockwise, SI un
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ridetune.control.kernel import Numbers, kernel
 
@@ -84,11 +84,17 @@ def locate(table: Numbers, index: int, x_m: float, y_m: float) -> tuple[int, flo
 
 
 @kernel
-def read_path(table: Numbers, column: int, at_m: float) -> float:
-    """A column's value at an arc length [m], interpolated; the ends go on for ever."""
+def _between(table: Numbers, at_m: float) -> tuple[int, float]:
+    """The point before an arc length [m], and the share of the way to the next one."""
     place = min(max(at_m / SPACING_M, 0.0), len(table) - 1.0)
     low = min(int(place), len(table) - 2)
-    share = place - low
+    return low, place - low
+
+
+@kernel
+def read_path(table: Numbers, column: int, at_m: float) -> float:
+    """A column's value at an arc length [m], interpolated; the ends go on for ever."""
+    low, share = _between(table, at_m)
     value: float = (1.0 - share) * table[low, column] + share * table[low + 1, column]
     return value
 
@@ -96,9 +102,7 @@ def read_path(table: Numbers, column: int, at_m: float) -> float:
 @kernel
 def read_curvatures(table: Numbers, at_m: float) -> tuple[float, float]:
     """The curvature and the smoothed curvature at an arc length [m], interpolated."""
-    place = min(max(at_m / SPACING_M, 0.0), len(table) - 1.0)
-    low = min(int(place), len(table) - 2)
-    share = place - low
+    low, share = _between(table, at_m)
     return (
         (1.0 - share) * table[low, CURVATURE] + share * table[low + 1, CURVATURE],
         (1.0 - share) * table[low, SMOOTH_CURVATURE] + share * table[low + 1, SMOOTH_CURVATURE],
@@ -111,17 +115,19 @@ def wrap(angle_rad: float) -> float:
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
+def _around(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The points half a baseline ahead of and behind each; the ends repeat."""
+    at, reach = np.arange(count), round(_BASELINE_M / SPACING_M)
+    return np.minimum(at + reach, count - 1), np.maximum(at - reach, 0)
+
+
 def _heading(x: Numbers, y: Numbers) -> Numbers:
-    reach = round(_BASELINE_M / SPACING_M)
-    ahead = np.minimum(np.arange(len(x)) + reach, len(x) - 1)
-    behind = np.maximum(np.arange(len(x)) - reach, 0)
+    ahead, behind = _around(len(x))
     return np.unwrap(np.arctan2(y[ahead] - y[behind], x[ahead] - x[behind]))
 
 
 def _slope(heading: Numbers) -> Numbers:
-    reach = round(_BASELINE_M / SPACING_M)
-    ahead = np.minimum(np.arange(len(heading)) + reach, len(heading) - 1)
-    behind = np.maximum(np.arange(len(heading)) - reach, 0)
+    ahead, behind = _around(len(heading))
     slope: Numbers = (heading[ahead] - heading[behind]) / ((ahead - behind) * SPACING_M)
     return slope
 

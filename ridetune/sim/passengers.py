@@ -16,18 +16,14 @@ This is a simulation: it shows how a policy fares under the stated `Priors`, not
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import NUM_PARAMETERS, STYLES, ControllerMatrix, Style, ki_limit
-from ridetune.sample import Condition
+from ridetune.sample import FEEDBACK_KINDS, Condition, FeedbackKind
 from ridetune.sim.metrics import DriveMetrics
-
-FeedbackKind = Literal["too_aggressive", "too_conservative", "just_right"]
-FEEDBACK_KINDS: tuple[FeedbackKind, ...] = ("too_aggressive", "too_conservative", "just_right")
 
 # What a passenger can tell of a drive, in this order wherever aspects are numbered.
 ASPECTS = ("t90", "peak |a_x|", "mean |J_x|", "peak felt |a_y|", "peak felt |J_y|", "smallest gap")
