@@ -62,7 +62,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PY) -m pip install -c constraints.txt -e ".[all,dev]"
 	@touch $@
 
-$(RUN)/data/manifest.json: $(wildcard data/*.py data/bank/*.yaml) $(CONTRACT) \
+$(RUN)/data/manifest.json: $(wildcard data/*.py data/bank/*.yaml ridetune/camera/*.py) $(CONTRACT) \
 		configs/data.yaml configs/ranges.yaml | $(INSTALLED)
 	$(PY) -m data --config configs/data.yaml out=$(RUN)/data
 

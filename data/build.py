@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from ridetune.camera.render import render
+from ridetune.camera.scene import Scene, describe, sample_scene, with_condition
 from ridetune.codec import MatrixCodec
 from ridetune.config import save_config
 from ridetune.matrix import STYLES, Ranges, Style
@@ -33,8 +35,6 @@ from ridetune.stage import Stopwatch, new_folder, write_manifest
 
 from .annotate import draw_matrix, explain
 from .instructions import Bank, Phrase, load_bank, pick, vary
-from .scene import Scene, describe, sample_scene, with_condition
-from .synthetic import render
 
 JPEG_QUALITY = 88
 _SPLIT_SEED: dict[Split, int] = {"train": 0, "calibration": 1, "test": 2}

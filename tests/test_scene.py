@@ -5,7 +5,7 @@ from typing import get_args
 
 import numpy as np
 
-from data.scene import Lead, Road, Scene, Surroundings, Traffic, describe, sample_scene
+from ridetune.camera.scene import Lead, Road, Scene, Surroundings, Traffic, describe, sample_scene
 from ridetune.sample import CONDITIONS
 from ridetune.scene import SCENE_QUESTIONS, scene_answers
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from data.scene import Scene, describe, sample_scene, with_condition
-from data.street import draw_layout
-from data.synthetic import render
+from ridetune.camera.render import render
+from ridetune.camera.scene import Scene, describe, sample_scene, with_condition
+from ridetune.camera.street import draw_layout
 from ridetune.sample import CONDITIONS, Condition
 
 BASE = Scene("sunny", "left curve", "near", "dense", "city", seed=7)

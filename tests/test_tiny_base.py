@@ -9,9 +9,9 @@ import torch
 
 from data.build import encode
 from data.instructions import load_bank
-from data.scene import sample_scene, with_condition
-from data.synthetic import render
 from ridetune.alignment import conservativeness
+from ridetune.camera.render import render
+from ridetune.camera.scene import sample_scene, with_condition
 from ridetune.contract import Contract, load_tokenizer
 from ridetune.matrix import ControllerMatrix
 from ridetune.policy import Policy

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from data.scene import sample_scene
-from data.synthetic import render
+from ridetune.camera.render import render
+from ridetune.camera.scene import sample_scene
 from ridetune.vision import (
     MAX_BYTES,
     FrameError,

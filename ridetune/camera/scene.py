@@ -1,9 +1,9 @@
 """Content of a synthetic picture: its categories, how they are drawn, and their description.
 
 In: a random stream. Out: a `Scene` (weather, road, lead vehicle, traffic, surroundings, seed)
-and a one-line description of it. `data.synthetic` renders a scene.
+and a one-line description of it. `render` draws a scene.
 
-    PYTHONPATH=. python -c "from data.scene import *; import numpy as np; \
+    python -c "from ridetune.camera.scene import *; import numpy as np; \
 print(describe(sample_scene(np.random.default_rng(0))))"    # any CPU
 """
 

@@ -2,8 +2,6 @@
 
 In: a canvas and a `Thing` that is a vehicle. Out: the vehicle in the image, in place; lit lamps
 go to the list of the canvas.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 from collections.abc import Callable
@@ -12,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atmosphere import Colour
-from .camera import Points
 from .canvas import WHITE, Canvas, mix, scale
+from .projection import Points
 from .street import Thing
 
 

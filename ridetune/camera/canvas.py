@@ -2,8 +2,6 @@
 
 In: a `Layout`, an `Atmosphere` and an RGB image. Out: polygons, bands of ground and rectangles in
 that image, in place, and a list of lamps that glow once everything is drawn.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atmosphere import Atmosphere, Colour
-from .camera import Camera, Points
+from .projection import Camera, Points
 from .street import Layout
 from .weather import Image
 

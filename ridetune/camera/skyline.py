@@ -1,15 +1,13 @@
 """Hills, far trees and far buildings at the horizon.
 
 In: a canvas and the surroundings. Out: silhouettes in its image, in place, seen through the haze.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 import numpy as np
 
 from .atmosphere import Colour
-from .camera import Points
 from .canvas import WHITE, Canvas, mix
+from .projection import Points
 from .scene import Surroundings
 from .street import FOLIAGE
 

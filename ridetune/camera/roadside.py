@@ -2,8 +2,6 @@
 
 In: a canvas and a `Thing` that is no vehicle. Out: the thing in the image, in place; lit lamps go
 to the list of the canvas.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 import cv2
@@ -11,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atmosphere import Colour
-from .camera import Points
 from .canvas import WHITE, Canvas, draw_rectangle, mix, scale
+from .projection import Points
 from .street import Thing
 
 WINDOW_Y, WINDOW_Z = np.array([0.32, 0.32, 0.82, 0.82]), np.array([-0.5, 0.5, 0.5, -0.5])

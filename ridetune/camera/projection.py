@@ -3,8 +3,6 @@
 In: points on or over the road. Out: pixels. Frames: x to the right of the centre line of the own
 path, y up from the ground, z along the road ahead of the camera, in metres; pixels (u, v) to the
 right and down.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 from dataclasses import dataclass

@@ -2,8 +2,6 @@
 
 In: a canvas. Out: the albedo of the ground in its image, in place; `weather.light_ground` adds
 light and haze afterwards.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 import cv2

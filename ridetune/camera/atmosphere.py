@@ -2,8 +2,6 @@
 
 In: a condition and a random stream. Out: an `Atmosphere` (light, haze, sky, wetness, snow) for
 the street drawing and the effects of `data.weather`.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 from dataclasses import dataclass

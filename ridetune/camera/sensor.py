@@ -1,8 +1,6 @@
 """Sensor of the synthetic front camera: optics, exposure, colours, noise and JPEG.
 
 In: the finished picture and a random stream. Out: the picture as a camera would store it.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 from functools import lru_cache

@@ -3,8 +3,6 @@
 In: an RGB image under construction, an `Atmosphere`, a random stream. Out: the effects, in place
 where they say so. Noise is drawn once per image size and cropped at random, so a frame costs a
 few milliseconds.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 from functools import lru_cache

@@ -2,8 +2,6 @@
 
 In: a `Scene` and a picture size. Out: a `Layout` with every `Thing` in metres, in the frames of
 `data.camera`. It comes from a random stream of the scene's seed and never sees the weather.
-
-    PYTHONPATH=. python -m pytest tests/test_synthetic.py    # any CPU
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from .atmosphere import Colour
-from .camera import Camera
+from .projection import Camera
 from .scene import Scene
 
 Kind = Literal["car", "suv", "van", "truck", "building", "tree", "lamp", "sign", "signal", "gantry"]

@@ -2,9 +2,6 @@
 
 In: a `Scene`. Out: an RGB picture. Geometry comes from a random stream of the seed alone, weather
 from a second one, the camera from a third, so `with_condition` changes nothing but the weather.
-
-    PYTHONPATH=. python -c "from data.scene import sample_scene; import numpy as np; \
-from data.synthetic import render; print(render(sample_scene(np.random.default_rng(0))).shape)"
 """
 
 from dataclasses import replace

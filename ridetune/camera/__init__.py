@@ -1,0 +1,1 @@
+"""The synthetic front camera: scenes with known content and their pictures."""
