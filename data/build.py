@@ -38,6 +38,7 @@ from .instructions import Bank, Phrase, load_bank, pick, vary
 
 JPEG_QUALITY = 88
 _SPLIT_SEED: dict[Split, int] = {"train": 0, "calibration": 1, "test": 2}
+_FEEDBACK_SPLITS: tuple[Split, ...] = ("train", "test")
 
 
 @dataclass(frozen=True)
@@ -213,9 +214,10 @@ def encode(pixels: Any) -> bytes:
 
 
 def _write_feedback(bank: Bank, folder: Path) -> None:
-    """The feedback sentences that no training row holds, to score what memories do."""
-    held_out = {kind: bank.feedback_of(kind, "test") for kind in FEEDBACK_KINDS}
-    (folder / "feedback-test.json").write_text(json.dumps(held_out, indent=2) + "\n")
+    """The feedback sentences by kind, and apart those that no training row holds."""
+    for split in _FEEDBACK_SPLITS:
+        sayings = {kind: bank.feedback_of(kind, split) for kind in FEEDBACK_KINDS}
+        (folder / f"feedback-{split}.json").write_text(json.dumps(sayings, indent=2) + "\n")
 
 
 def _write_phrases(config: DataConfig, bank: Bank, codec: MatrixCodec, folder: Path) -> int:

@@ -34,7 +34,7 @@ from train.collate import collate, tokenize
 from train.objective import soft_bins
 from train.pixels import Augment, patches_of
 from train.reword import Rewording
-from train.rows import read_phrases, read_pixels
+from train.rows import read_feedback, read_phrases, read_pixels
 from train.schedule import Steps
 from train.score import query_logits
 from train.teacher import Teacher
@@ -118,7 +118,7 @@ def tiny_config(out: Path) -> TinyConfig:
         f"{stage}={{steps: {steps}, batch: 4, learning_rate: 1.0e-3}}"
         for stage, steps in (("pictures", 2), ("both", 4))
     ]
-    words = "steps: 4, batch: 4, learning_rate: 1.0e-3, rewordings: 10"
+    words = "steps: 4, batch: 4, learning_rate: 1.0e-3, rewordings: 10, distillation: 1.0"
     teacher = "{steps: 2, batch: 4, learning_rate: 1.0e-3}"
     return load_config(
         TinyConfig,
@@ -126,10 +126,11 @@ def tiny_config(out: Path) -> TinyConfig:
         [
             *sizes,
             *stages,
-            f"words={{{words}, teacher: {teacher}, distillation: 1.0, as_text_share: 0.5}}",
+            f"words={{{words}, teacher: {teacher}, feedback: 0.3, text_share: 0.5}}",
             f"data={small_data()}",
             f"out={out}",
             f"ranges={RANGES}",
+            "processes=1",
             "threads=1",
             "words_in_both=0.5",
             "as_text_share=0.5",
@@ -152,7 +153,11 @@ def test_pretraining_writes_a_folder_that_the_other_stages_read(
     manifest = json.loads((config.out / "manifest.json").read_text())
     assert manifest["parameters"] == model.num_parameters()
     assert {"model.safetensors", "tokenizer.json", "ridetune.json"} <= set(manifest["files"])
-    assert [path.name for path in tmp_path.iterdir()] == ["tiny"]
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny", "tiny-stages"]
+
+
+def kind_of() -> dict[str, int]:
+    return read_feedback(small_data() / "feedback-train.json")
 
 
 def state(model: Any, part: str) -> dict[str, Tensor]:
@@ -173,7 +178,7 @@ def test_words_train_the_language_model_and_pictures_the_vision_tower(
     language, visual = state(model, "language_model"), state(model, "visual")
 
     rewording = Rewording(*teacher.words_of(prompts.tokenizer, SHAPE.hidden))
-    lessons = teach(teacher, rewording, phrases, phrases[:3], config.words, seed=0)
+    lessons = teach(teacher, rewording, phrases, phrases[:3], kind_of(), config.words, seed=0)
     task = WordsTask(model, contract, prompts, lessons, word_dropout=0.1)
     learn_words(task, phrases[:3], config.words, seed=0)
     assert changed(language, state(model, "language_model"))
@@ -213,7 +218,7 @@ def test_variations_share_the_teachers_vector_and_only_reworded_ones_its_opinion
     ]
     plan = replace(tiny_config(tmp_path).words, rewordings=3)
     rewording = Rewording(*teacher.words_of(small_prompts().tokenizer, SHAPE.hidden))
-    lessons = teach(teacher, rewording, phrases, phrases, plan, seed=0)
+    lessons = teach(teacher, rewording, phrases, phrases, kind_of(), plan, seed=0)
     assert len(lessons.samples) == 7
     assert lessons.has_vector.tolist() == [1, 0, 1, 1, 1, 1, 1]
     assert lessons.has_opinion.tolist() == [False] * 4 + [True] * 3

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ridetune.sample import Sample
+from ridetune.sample import FEEDBACK_KINDS, Sample
 from ridetune.vision import VisionSpec, decode_frame, fit_frame
 
 
@@ -19,6 +19,12 @@ def read_phrases(path: Path) -> list[Sample]:
     with path.open() as file:
         rows = [json.loads(line) for line in file]
     return [Sample.of_row({**row, "image": {"bytes": b"-"}}) for row in rows]
+
+
+def read_feedback(path: Path) -> dict[str, int]:
+    """Sentences of feedback with the number of their kind in FEEDBACK_KINDS."""
+    sayings = json.loads(path.read_text())
+    return {text: FEEDBACK_KINDS.index(kind) for kind, texts in sayings.items() for text in texts}
 
 
 def read_pixels(samples: Sequence[Sample], spec: VisionSpec) -> NDArray[np.uint8]:

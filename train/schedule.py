@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from .processes import average_gradients, is_first, own_share
+
 LossOf = Callable[[list[int], np.random.Generator], Tensor]
 
 
@@ -49,6 +51,8 @@ def train_steps(
 ) -> None:
     """Minimise `loss_of(sample numbers, rng)` over the trainable parameters of `parts`.
 
+    Several processes share each batch.
+
     lengths: tokens of each sample. watch: asked every tenth of the way, its answer is printed.
     """
     parameters = [p for part in parts for p in part.parameters() if p.requires_grad]
@@ -58,13 +62,16 @@ def train_steps(
     done = checkpoints.load(optimizer) if checkpoints is not None else 0
     batches = islice(endless_batches(lengths, plan.batch, seed), done, None)
     mean: float | None = None
-    with tqdm(total=plan.steps, initial=done, desc=about, unit="step") as bar:
+    with tqdm(
+        total=plan.steps, initial=done, desc=about, unit="step", disable=not is_first()
+    ) as bar:
         for step in range(done, plan.steps):
             torch.manual_seed(hash((seed, step)) % 2**31)
             set_rate(optimizer, plan.learning_rate * cosine(step, plan.steps))
-            loss = loss_of(next(batches), np.random.default_rng([seed, step]))
+            loss = loss_of(own_share(next(batches)), np.random.default_rng([seed, step]))
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
+            average_gradients(parameters)
             torch.nn.utils.clip_grad_norm_(parameters, 1.0)
             optimizer.step()
             if checkpoints is not None:
@@ -72,7 +79,7 @@ def train_steps(
             mean = loss.item() if mean is None else 0.98 * mean + 0.02 * loss.item()
             bar.set_postfix(loss=f"{mean:.3f}", refresh=False)
             bar.update()
-            if watch is not None and (step + 1) % max(plan.steps // 10, 1) == 0:
+            if watch is not None and is_first() and (step + 1) % max(plan.steps // 10, 1) == 0:
                 tqdm.write(f"{about} step={step + 1} loss={mean:.4f} {watch()}")
 
 

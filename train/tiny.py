@@ -8,10 +8,14 @@ In: a dataset of `python -m data --config configs/data-pretrain.yaml`. Out: a mo
 Hugging Face tools read it, in fp16. Trained once and committed as models/tiny.
 
     python -m train.tiny --config configs/tiny.yaml
+
+What a stage made is kept beside the model, so a run that was stopped goes on behind its last whole
+stage.
 """
 
+import hashlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,18 +33,19 @@ from ridetune.prompt import ACTION_TOKENS, PromptBuilder
 from ridetune.qwen import encode_frames
 from ridetune.sample import Sample, read_samples
 from ridetune.scene import SCENE_QUESTIONS, scene_answers
-from ridetune.stage import Stopwatch, new_folder, run_stage, write_manifest
+from ridetune.stage import Stopwatch, hash_file, new_folder, run_stage, write_manifest
 
 from .base import TinyShape, build_model, build_tokenizer, save_tokenizer, vision_spec
 from .collate import collate, tokenize
 from .objective import batch_loss
 from .pixels import Augment, patches_of
+from .processes import in_processes, is_first, own_share, wait_for_all
 from .reword import Rewording
-from .rows import read_phrases, read_pixels
+from .rows import read_feedback, read_phrases, read_pixels
 from .schedule import Steps, endless_batches, train_steps
 from .score import score_phrases
 from .teacher import Teacher
-from .words import WordsPlan, WordsTask, drop_words, learn_words, teach, text_length
+from .words import Lessons, WordsPlan, WordsTask, drop_words, learn_words, teach, text_length
 
 EMBEDDING_SCALE = 0.04
 
@@ -54,7 +59,8 @@ class TinyConfig:
     ranges: Path
     seed: int
     device: str
-    threads: int
+    processes: int  # share each batch
+    threads: int  # of each process
     shape: TinyShape
     words: WordsPlan
     pictures: Steps
@@ -66,7 +72,11 @@ class TinyConfig:
 
 
 def pretrain(config: TinyConfig) -> None:
-    """Run the three stages and write the model folder."""
+    """Run the three stages in all processes and write the model folder."""
+    in_processes(config.processes, _pretrain, config)
+
+
+def _pretrain(config: TinyConfig) -> None:
     watch = Stopwatch()
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
@@ -81,14 +91,33 @@ def pretrain(config: TinyConfig) -> None:
     start_embeddings(model, prompts, pieces, vectors)
     model.to(torch.device(config.device))
 
-    rewording = Rewording(pieces, vectors)
-    lessons = teach(teacher, rewording, phrases, held_out, config.words, config.seed)
+    stages = Stages(config)
+
+    def lessons_of() -> Lessons:
+        kind_of = read_feedback(config.data / "feedback-train.json")
+        rewording = Rewording(pieces, vectors)
+        return teach(teacher, rewording, phrases, held_out, kind_of, config.words, config.seed)
+
+    lessons: Lessons = stages.once("lessons", lessons_of)
     task = WordsTask(model, contract, prompts, lessons, config.word_dropout)
-    learn_words(task, held_out, config.words, config.seed)
+    language, visual = model.model.language_model, model.model.visual
+
+    def words() -> Any:
+        learn_words(task, held_out, config.words, config.seed)
+        return language.state_dict()
+
+    language.load_state_dict(stages.once("words", words))
     samples = read_samples(config.data / "train.parquet")
     pixels = read_pixels(samples, contract.vision)
-    learn_pictures(model, contract, samples, pixels, config)
+
+    def pictures() -> Any:
+        learn_pictures(model, contract, samples, pixels, config)
+        return visual.state_dict()
+
+    visual.load_state_dict(stages.once("pictures", pictures))
     learn_both(model, contract, prompts, samples, pixels, task, held_out, config)
+    if not is_first():
+        return
 
     with new_folder(config.out) as folder:
         model.half().save_pretrained(folder)
@@ -97,6 +126,34 @@ def pretrain(config: TinyConfig) -> None:
         save_config(config, folder / "pretraining.yaml")
         write_manifest(folder, seconds=watch.seconds, facts={"parameters": model.num_parameters()})
     print(f"tiny base: {model.num_parameters()} parameters in {config.out}, {watch.seconds:.0f} s")
+
+
+class Stages:
+    """What the stages of a run have made, kept in a folder of its own beside the model.
+
+    The folder is named after the data and all that shapes the stages before the last; a change of
+    the code is not noticed.
+    """
+
+    def __init__(self, config: TinyConfig) -> None:
+        shaping = (config.seed, config.shape, config.words, config.pictures, config.word_dropout)
+        about = hash_file(config.data / "manifest.json") + repr(shaping)
+        name = hashlib.sha256(about.encode()).hexdigest()[:12]
+        self._folder = config.out.with_name(f"{config.out.name}-stages") / name
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._found = {path.stem for path in self._folder.glob("*.pt")}
+        wait_for_all()  # so that all have found the same
+
+    def once(self, stage: str, make: Callable[[], Any]) -> Any:
+        """What the stage made, now or in an earlier run."""
+        path = self._folder / f"{stage}.pt"
+        if stage in self._found:
+            return torch.load(path, weights_only=False)
+        made = make()
+        if is_first():
+            torch.save(made, path.with_suffix(".new"))
+            path.with_suffix(".new").rename(path)
+        return made
 
 
 def start_embeddings(
@@ -156,11 +213,11 @@ def learn_both(
 ) -> None:
     """Stage three: everything together, with text-only batches mixed in to keep the words."""
     augment = Augment()
-    words = endless_batches(task.lengths, 2 * config.both.batch, config.seed + 1)
+    word_batches = endless_batches(task.lengths, 2 * config.both.batch, config.seed + 1)
 
     def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
         if rng.random() < config.words_in_both:
-            return task.actions(next(words), rng)[0]
+            return task.actions(own_share(next(word_batches)), rng)[0]
         patches = patches_of(pixels[chosen], contract.vision, augment, rng).to(model.device)
         features = encode_frames(model, patches, contract.vision)
         as_text = rng.random(len(chosen)) < config.as_text_share

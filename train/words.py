@@ -2,12 +2,13 @@
 
     written and grown sentences   their own labels
     reworded sentences            the teacher's shares of the styles, as a mixture of labels
-    a part of the batches         the matrix as text, the paper's way
+    a part of the batches         with text: half the matrix, the paper's way, half the explanation
 
-Beside the six bins the last query learns to predict the teacher's vector of the sentence.
+Beside the six bins, throw-away heads on the queries predict the teacher's vector of the sentence
+and what kind of feedback the memories hold.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from ridetune.contract import Contract
 from ridetune.matrix import NUM_PARAMETERS, STYLES
 from ridetune.prompt import PromptBuilder
 from ridetune.qwen import action_logits, run_tokens
-from ridetune.sample import Sample
+from ridetune.sample import FEEDBACK_KINDS, Sample
 
 from .collate import Batch, Example, collate, tokenize, without_answer
 from .objective import batch_loss, soft_bins
@@ -43,7 +44,8 @@ class WordsPlan:
     teacher: Steps
     rewordings: int
     distillation: float  # weight of the distance to the teacher's vector
-    as_text_share: float  # share of batches that answer the paper's way
+    feedback: float  # weight of telling what kind of feedback the memories hold
+    text_share: float  # share of batches that also learn to write
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,8 @@ class Lessons:
     """Samples with what the teacher says of them.
 
     vectors [sample, 384] and whether there is one, has_vector [sample]; opinions [sample, 3] are
-    shares of the styles, used instead of the label where has_opinion [sample].
+    shares of the styles, used instead of the label where has_opinion [sample]. feedback [sample]
+    is the kind that the memories hold, in FEEDBACK_KINDS; -1 without memories.
     """
 
     samples: list[Sample]
@@ -59,6 +62,7 @@ class Lessons:
     has_vector: Tensor
     opinions: Tensor
     has_opinion: Tensor
+    feedback: Tensor
 
 
 class WordsTask:
@@ -78,7 +82,7 @@ class WordsTask:
         self.lengths = [text_length(sample) for sample in lessons.samples]
 
     def actions(self, chosen: list[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Loss of the six bins, and the last hidden state of the last query [sample, hidden]."""
+        """Loss of the six bins, and the last hidden states of the queries [sample, 6, hidden]."""
         lessons, device = self.lessons, self.model.device
         examples = [words_only(lessons.samples[i], self.prompts) for i in chosen]
         batch = drop_words(collate(examples), self.prompts, self._word_dropout, rng).to(device)
@@ -88,13 +92,17 @@ class WordsTask:
         unsure = lessons.has_opinion[chosen].to(device)[:, None, None]
         targets = torch.where(unsure, mixed, soft_bins(batch.bins))
         logits = action_logits(self.model, at_queries, self.prompts.ids).float()
-        return F.cross_entropy(logits.flatten(0, 1), targets.flatten(0, 1)), at_queries[:, -1]
+        return F.cross_entropy(logits.flatten(0, 1), targets.flatten(0, 1)), at_queries
 
-    def text(self, chosen: list[int]) -> Tensor:
-        """Loss of the matrix as text; samples without a label of their own are left out."""
+    def text(self, chosen: list[int], rng: np.random.Generator) -> Tensor:
+        """Loss of the matrix as text, or of bins and explanation; opinions are no labels here."""
         rows = [i for i in chosen if not self.lessons.has_opinion[i]] or [0]
         samples = [self.lessons.samples[i] for i in rows]
-        examples = [tokenize(s, self.prompts, image=False, as_text=True) for s in samples]
+        as_text = rng.random(len(samples)) < 0.5
+        examples = [
+            tokenize(sample, self.prompts, image=False, as_text=bool(text))
+            for sample, text in zip(samples, as_text, strict=True)
+        ]
         batch = collate(examples).to(self.model.device)
         ids = self.prompts.ids
         loss, _ = batch_loss(self.model, batch, None, ids, text_weight=1.0, fixed_vocabulary=True)
@@ -105,23 +113,28 @@ def learn_words(task: WordsTask, held_out: list[Sample], plan: WordsPlan, seed: 
     """Train the language model on sentences and memories, without images."""
     model, lessons = task.model, task.lessons
     torch.manual_seed(seed)
-    head = nn.Linear(model.config.text_config.hidden_size, lessons.vectors.shape[1])
-    head.to(model.device)
+    width = model.config.text_config.hidden_size
+    meaning = nn.Linear(width, lessons.vectors.shape[1]).to(model.device)
+    kind = nn.Linear(width, len(FEEDBACK_KINDS)).to(model.device)
 
     def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
-        if rng.random() < plan.as_text_share:
-            return task.text(chosen)
-        actions, last = task.actions(chosen, rng)
-        far = head(last) - lessons.vectors[chosen].to(model.device)
+        if rng.random() < plan.text_share:
+            return task.text(chosen, rng)
+        loss, queries = task.actions(chosen, rng)
+        far = meaning(queries[:, -1]) - lessons.vectors[chosen].to(model.device)
         known = lessons.has_vector[chosen].to(model.device)
-        distance = (far.square().mean(dim=1) * known).mean()
-        return torch.as_tensor(actions + plan.distillation * distance)
+        loss = loss + plan.distillation * (far.square().mean(dim=1) * known).mean()
+        feedback = lessons.feedback[chosen].to(model.device)
+        if bool((feedback >= 0).any()):
+            told = F.cross_entropy(kind(queries.mean(dim=1)), feedback, ignore_index=-1)
+            loss = loss + plan.feedback * told
+        return torch.as_tensor(loss)
 
     def watch() -> str:
         return score_phrases(model, task.contract, task.prompts, held_out)
 
     steps = Steps(plan.steps, plan.batch, plan.learning_rate)
-    parts = [model.model.language_model, head]
+    parts = [model.model.language_model, meaning, kind]
     train_steps("words", parts, task.lengths, loss_of, steps, seed, watch=watch)
 
 
@@ -130,13 +143,15 @@ def teach(
     rewording: Rewording,
     phrases: list[Sample],
     held_out: list[Sample],
+    kind_of: Mapping[str, int],
     plan: WordsPlan,
     seed: int,
 ) -> Lessons:
     """Fine-tune the teacher on the phrases, let it judge reworded ones, gather all lessons.
 
     Rows with memories are three times as long, so only every second of them takes part. A written
-    sentence and its variations share one vector; what the grammar grew has none.
+    sentence and its variations share one vector; what the grammar grew has none. kind_of tells the
+    kind of each sentence of feedback.
     """
     phrases = [sample for i, sample in enumerate(phrases) if not sample.memories or i % 2]
     plain = [sample for sample in phrases if not sample.memories]
@@ -170,6 +185,9 @@ def teach(
         has_vector=(own >= 0).float(),
         opinions=heard.styles[own],
         has_opinion=torch.arange(len(own)) >= len(phrases),
+        feedback=torch.tensor(
+            [kind_of[s.memories[0].feedback] if s.memories else -1 for s in (*phrases, *reworded)]
+        ),
     )
 
 
