@@ -20,7 +20,7 @@ from tqdm import tqdm
 from ridetune.camera.render import render
 from ridetune.camera.scene import Scene, describe, sample_scene, with_condition
 from ridetune.codec import MatrixCodec
-from ridetune.config import save_config
+from ridetune.config import Count, Share, save_config
 from ridetune.matrix import STYLES, Ranges, Style
 from ridetune.sample import (
     CONDITIONS,
@@ -48,15 +48,15 @@ class DataConfig:
     out: Path
     ranges: Path
     seed: int
-    train_scenes: int
-    calibration_scenes: int
-    test_scenes: int
-    instructions_per_frame: int
-    memory_share: float
-    grammar_share: float
-    phrases: int
-    frame_width: int
-    frame_height: int
+    train_scenes: Count
+    calibration_scenes: Count
+    test_scenes: Count
+    instructions_per_frame: Count
+    memory_share: Share
+    grammar_share: Share
+    phrases: Count
+    frame_width: Count
+    frame_height: Count
 
 
 @dataclass(frozen=True)

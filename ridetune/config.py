@@ -3,12 +3,15 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
+Count = Annotated[int, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Config = TypeVar("Config")
 
 
@@ -60,12 +63,20 @@ def _override(raw: dict[str, Any], override: str) -> None:
         raise ValueError(f"override {override!r}: the value is not valid YAML") from error
 
 
-def _check_keys(kind: Any, raw: Mapping[str, Any], where: str) -> None:
+def _check_keys(kind: Any, value: Any, where: str) -> None:
+    """Refuse unknown keys at any depth; a section may be optional, in a list or in a mapping."""
+    if not is_dataclass(kind):
+        many = isinstance(value, Mapping) and get_origin(kind) in (dict, Mapping)
+        items = list(value.values()) if many else value if isinstance(value, list) else [value]
+        for inner, item in product(get_args(kind), items):
+            _check_keys(inner, item, where)
+        return
+    if not isinstance(value, Mapping):
+        return
     known = [field.name for field in fields(kind)]
     types = get_type_hints(kind)
-    for key, value in raw.items():
+    for key, inner in value.items():
         if key not in known:
             near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)
             raise ValueError(f"{where}: unknown key {key!r}; did you mean {near[0]!r}?")
-        if is_dataclass(types[key]) and isinstance(value, Mapping):
-            _check_keys(types[key], value, f"{where}: {key}")
+        _check_keys(types[key], inner, f"{where}: {key}")

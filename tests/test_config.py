@@ -1,12 +1,12 @@
 """YAML and overrides -> a frozen dataclass, with errors that say what to do."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
-from ridetune.config import load_config, save_config
+from ridetune.config import Count, Share, load_config, save_config
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,11 @@ class Config:
     optimizer: Optimizer
     method: Literal["rtn", "awq"] = "awq"
     frames: Path | None = None
+    warm_up: Optimizer | None = None
+    phases: tuple[Optimizer, ...] = ()
+    by_name: dict[str, Optimizer] = field(default_factory=dict)
+    workers: Count = 1
+    share: Share = 0.5
 
 
 GOOD = "out: runs/x\nseed: 3\noptimizer: {learning_rate: 0.01, steps: 5}\n"
@@ -63,6 +68,11 @@ def test_the_last_override_of_a_key_wins(path: Path) -> None:
         ("seed=1.5", "seed: .* got 1.5"),
         ("method=gptq", "method: .* got 'gptq'"),
         ("optimizer.learning_rate=null", "optimizer.learning_rate: .* got None"),
+        ("warm_up={step: 4}", "warm_up: unknown key 'step'; did you mean 'steps'"),
+        ("phases=[{step: 4}]", "phases: unknown key 'step'; did you mean 'steps'"),
+        ("by_name={first: {step: 4}}", "by_name: unknown key 'step'; did you mean 'steps'"),
+        ("workers=-1", "workers: .* got -1"),
+        ("share=1.5", "share: .* got 1.5"),
         ("out=[", "the value is not valid YAML"),
     ],
 )
