@@ -89,10 +89,32 @@ def test_patches_of_real_frames_equal_those_of_hugging_face(condition: str) -> N
     assert np.abs(ours - _by_hugging_face(pixels, QWEN3_TINY)).max() <= 1e-5
 
 
-def test_decoded_pixels_of_a_jpeg_equal_those_of_pillow() -> None:
+def test_decoded_pixels_of_a_jpeg_equal_those_of_opencv() -> None:
     jpeg = _encode(_frame(), "JPEG", quality=88)
-    expected = np.asarray(Image.open(io.BytesIO(jpeg)).convert("RGB"), np.int16)
+    decoded = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert decoded is not None
+    expected = decoded.astype(np.int16)
     assert np.abs(decode_frame(jpeg).astype(np.int16) - expected).max() <= 1
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_large_jpeg_is_decoded_small_and_looks_the_same(orientation: int) -> None:
+    turned = orientation == 6
+    exif = Image.Exif()
+    exif[274] = orientation
+    size = (900, 1600) if turned else (1600, 900)
+    jpeg = _encode(_frame(1, *size), "JPEG", quality=90, exif=exif)
+    small = decode_frame(jpeg, (448, 256))
+    assert small.shape == (450, 800, 3)
+    assert decode_frame(jpeg).shape == (900, 1600, 3)
+    whole = fit_frame(decode_frame(jpeg), QWEN3_TINY).astype(np.int16)
+    assert np.abs(fit_frame(small, QWEN3_TINY) - whole).mean() < 1.0  # of 255 levels
+
+
+def test_a_jpeg_is_never_decoded_smaller_than_asked() -> None:
+    jpeg = _encode(_frame(1, 890, 600), "JPEG")
+    assert decode_frame(jpeg, (448, 256)).shape == (600, 890, 3)
+    assert decode_frame(jpeg, (445, 256)).shape == (300, 445, 3)
 
 
 def test_a_patch_holds_channel_time_row_column_and_blocks_stay_together() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ridetune.sample import FEEDBACK_KINDS, Sample
-from ridetune.vision import VisionSpec, decode_frame, fit_frame
+from ridetune.vision import VisionSpec, read_fitted
 
 
 def read_phrases(path: Path) -> list[Sample]:
@@ -32,5 +32,5 @@ def read_pixels(samples: Sequence[Sample], spec: VisionSpec) -> NDArray[np.uint8
     shape = (len(samples), spec.height_px, spec.width_px, 3)
     pixels = np.empty(shape, np.uint8)
     for i, sample in enumerate(tqdm(samples, desc="frames", unit="frame")):
-        pixels[i] = fit_frame(decode_frame(sample.observation.frame), spec)
+        pixels[i] = read_fitted(sample.observation.frame, spec)
     return pixels
