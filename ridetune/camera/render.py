@@ -15,17 +15,23 @@ from . import sensor, weather
 from .atmosphere import draw_atmosphere
 from .canvas import Canvas, mix, scale
 from .ground import draw_ground, draw_shadows
+from .obstacles import OBSTACLES, draw_obstacle
 from .roadside import draw_building, draw_post, draw_rails, draw_tree
 from .scene import Scene
 from .skyline import draw_skyline
-from .street import PAINTS, VEHICLES, Thing, draw_layout
+from .street import PAINTS, VEHICLES, Layout, Thing, draw_layout
 from .vehicles import draw_vehicle
 from .weather import Image
 
 
 def render(scene: Scene, width: int = 448, height: int = 256) -> Image:
     """Picture of a scene: RGB uint8 [height, width, 3], the same for the same arguments."""
-    layout = draw_layout(scene, width, height)
+    return paint(scene, draw_layout(scene, width, height))
+
+
+def paint(scene: Scene, layout: Layout) -> Image:
+    """Picture of a layout under the sky, in the weather and through the lens of a scene."""
+    width, height = layout.camera.width, layout.camera.height
     rng = np.random.default_rng([scene.seed, 1, CONDITIONS.index(scene.condition)])
     air = draw_atmosphere(scene.condition, rng)
     canvas = Canvas(np.empty((height, width, 3), np.uint8), layout, air, [])
@@ -66,6 +72,8 @@ def _draw_things(canvas: Canvas, scene: Scene) -> None:
             draw_vehicle(canvas, thing)
             if canvas.air.wet > 0.1 and thing.z < 45:
                 _mirror(canvas, thing)
+        elif thing.kind in OBSTACLES:
+            draw_obstacle(canvas, thing)
         else:
             draw_post(canvas, thing)
 

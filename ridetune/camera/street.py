@@ -13,7 +13,11 @@ from .atmosphere import Colour
 from .projection import Camera
 from .scene import Scene
 
-Kind = Literal["car", "suv", "van", "truck", "building", "tree", "lamp", "sign", "signal", "gantry"]
+Kind = Literal[
+    "car", "suv", "van", "truck",
+    "building", "tree", "lamp", "sign", "signal", "gantry",
+    "pedestrian", "barrier", "bag",
+]  # fmt: skip
 VEHICLES: dict[str, tuple[float, float, float]] = {  # width, height, length in m
     "car": (1.8, 1.45, 4.4),
     "suv": (1.95, 1.75, 4.7),
@@ -45,6 +49,15 @@ class Thing:
     colour: Colour
     facing: Literal["rear", "front", "side"] = "rear"
     variant: float = 0.0  # 0..1, picks details
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The own carriageway: how many lanes lie on each side of the own one, and their width."""
+
+    to_the_left: int
+    to_the_right: int
+    width_m: float
 
 
 @dataclass(frozen=True)
@@ -190,45 +203,45 @@ def _roadside(scene: Scene, rng: np.random.Generator, layout: Layout) -> list[Th
                 (25, 85, 60) if rng.random() < 0.5 else (30, 70, 150),
             )
         )
-    if layout.crossing:
-        low, high = layout.crossing
-        things = [
-            t
-            for t in things
-            if t.z + (t.size[2] if t.kind == "building" else 0) < low - 1 or t.z > high + 1
-        ]
-        state = float(rng.random())
-        things.append(
-            Thing(
-                "signal",
-                right + 0.5,
-                max(low - 1.5, 9.0),
-                (0.5, 3.6 + rng.random(), 0),
-                (40, 42, 44),
-                "rear",
-                state,
-            )
-        )
-        things.append(
-            Thing("signal", left - 0.5, high + 1.0, (0.5, 4.2, 0), (40, 42, 44), "rear", state)
-        )
-        if rng.random() < 0.6:
-            things.append(
-                Thing(
-                    "signal", 0.8, high + 1.0, (0.6, 5.6, right - 0.8), (40, 42, 44), "rear", state
-                )
-            )
-    return things
+    return open_crossing(things, layout, rng) if layout.crossing else things
 
 
-def draw_layout(scene: Scene, width: int, height: int) -> Layout:
-    """Geometry of a scene for one picture size; uses the seed but never the condition."""
+def open_crossing(things: list[Thing], layout: Layout, rng: np.random.Generator) -> list[Thing]:
+    """The things that leave the crossing road of a layout free, and the signals before it."""
+    assert layout.crossing is not None
+    low, high = layout.crossing
+    left = min(layout.left, layout.opposite_left) - layout.shoulder_m
+    right = layout.right + layout.shoulder_m
+    free = [
+        t
+        for t in things
+        if t.z + (t.size[2] if t.kind == "building" else 0) < low - 1 or t.z > high + 1
+    ]
+    state, near = float(rng.random()), max(low - 1.5, 9.0)
+    grey = (40, 42, 44)
+    tall = (0.5, 3.6 + rng.random(), 0)
+    free.append(Thing("signal", right + 0.5, near, tall, grey, "rear", state))
+    free.append(Thing("signal", left - 0.5, high + 1.0, (0.5, 4.2, 0), grey, "rear", state))
+    if rng.random() < 0.6:
+        arm = (0.6, 5.6, right - 0.8)
+        free.append(Thing("signal", 0.8, high + 1.0, arm, grey, "rear", state))
+    return free
+
+
+def draw_layout(scene: Scene, width: int, height: int, lanes: Lanes | None = None) -> Layout:
+    """Geometry of a scene for one picture size; uses the seed but never the condition.
+
+    lanes: the own carriageway where it is known; the seed draws it otherwise.
+    """
     rng = np.random.default_rng([scene.seed, 0])
     camera = _camera(scene, rng, width, height)
     lane = float(rng.uniform(3.0, 3.7))
     highway, country = scene.surroundings == "highway", scene.surroundings == "country"
     own = 1 if country else int(rng.integers(2, 4)) if highway else int(rng.integers(1, 3))
     left = -(int(rng.integers(own)) + 0.5) * lane + float(rng.uniform(-0.35, 0.35))
+    if lanes is not None:
+        lane, own = lanes.width_m, 1 + lanes.to_the_left + lanes.to_the_right
+        left = -(lanes.to_the_left + 0.5) * lane
     median = float(rng.uniform(2.0, 7.0)) if highway else 0.0
     crossing = None
     if scene.road == "intersection":
