@@ -13,6 +13,14 @@ INSTALLED = $(VENV)/.installed
 LIBRARY = $(wildcard ridetune/*.py ridetune/*/*.py)
 EXPORT = $(addprefix quantize/,export.py graphs.py onnx_files.py operators.py parity.py)
 BENCHMARK = quantize/benchmark.py quantize/served_memory.py
+# What a result of the evaluation is made by; the page is drawn anew without measuring anew.
+REPORT = $(addprefix evaluate/,__main__.py report.py alignment.py decisions.py)
+PAGE = $(wildcard evaluate/page_parts/*) $(addprefix evaluate/,page.py animation.py curves.py \
+	plots.py sections.py style_drives.py tables.py)
+SWEEP = $(addprefix evaluate/,sweep.py sweep_runs.py workers.py)
+LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP),$(wildcard evaluate/*.py))
+SIMULATION = $(wildcard ridetune/control/*.py ridetune/sim/*.py) configs/ranges.yaml \
+	configs/vehicle.yaml
 CONTRACT = $(addprefix ridetune/,alignment.py codec.py config.py matrix.py sample.py stage.py)
 
 # Every model is a folder on this disk; nothing is looked up elsewhere.
@@ -20,7 +28,7 @@ export HF_HUB_OFFLINE = 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help venv data train quantize bench serve demo test lint types clean
+.PHONY: help venv data train quantize bench sweep evaluate serve demo test lint types clean
 
 help:  ## Print this list
 	@grep -E '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/^([a-z]+):[^#]*## /\1|/' \
@@ -31,6 +39,8 @@ data: $(RUN)/data/manifest.json  ## Build the dataset
 train: $(RUN)/merged/manifest.json  ## Fine-tune with LoRA and merge the adapter
 quantize: $(RUN)/bundle/bundle.json  ## Quantize to 4-bit AWQ and export the bundle
 bench: $(RUN)/evaluation.json  ## Profile the bundle's latency and score what it does
+sweep: $(RUN)/sweep.json  ## Drive 5,040 drawn matrices through every scenario and condition
+evaluate: $(RUN)/report.html  ## Drive, score, and write it all on one page
 
 serve: $(RUN)/.profiled  ## Serve the bundle on this machine (PORT=8470)
 	$(PY) -m serve --config configs/serve.yaml bundle=$(RUN)/bundle port=$(PORT)
@@ -92,7 +102,20 @@ $(RUN)/.profiled: $(RUN)/bundle/bundle.json $(BENCHMARK) configs/benchmark.yaml 
 		bundle=$(RUN)/bundle data=$(RUN)/data run=$(RUN) out=$(RUN)/profile
 	@touch $@
 
-$(RUN)/evaluation.json: $(RUN)/.profiled $(wildcard evaluate/*.py) $(LIBRARY) \
-		configs/evaluate.yaml | $(INSTALLED)
+$(RUN)/evaluation.json: $(RUN)/.profiled $(REPORT) $(LIBRARY) configs/evaluate.yaml | $(INSTALLED)
 	$(PY) -m evaluate --config configs/evaluate.yaml bundle=$(RUN)/bundle data=$(RUN)/data \
 		merged=$(RUN)/merged quantized=$(RUN)/awq out=$@
+
+$(RUN)/closed_loop.json: $(RUN)/.profiled $(LOOP) $(LIBRARY) configs/closed_loop.yaml \
+		configs/driving_score.yaml configs/vehicle.yaml | $(INSTALLED)
+	$(PY) -m evaluate.closed_loop --config configs/closed_loop.yaml bundle=$(RUN)/bundle \
+		data=$(RUN)/data out=$@
+
+$(RUN)/sweep.json: $(SWEEP) $(SIMULATION) configs/sweep.yaml | $(INSTALLED)
+	$(PY) -m evaluate.sweep --config configs/sweep.yaml out=$@
+
+$(RUN)/report.html: $(RUN)/evaluation.json $(RUN)/closed_loop.json $(RUN)/sweep.json $(PAGE) \
+		$(SIMULATION) configs/page.yaml configs/driving_score.yaml | $(INSTALLED)
+	$(PY) -m evaluate.page --config configs/page.yaml evaluation=$(RUN)/evaluation.json \
+		profile=$(RUN)/profile/profile.json closed_loop=$(RUN)/closed_loop.json \
+		sweep=$(RUN)/sweep.json out=$@

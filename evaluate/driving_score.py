@@ -12,6 +12,20 @@ the latency and all weights are ours, with reasons, in configs/driving_score.yam
 from the paper's printed scores is shown, not fitted:
 
     python -m evaluate.driving_score
+
+What the score says, and what it does not:
+
+    Motion is "lower is better" throughout (the arrows of Table 1) and is compared with the default;
+    the only time that counts is the model's. So an aggressive drive, asked for and well driven,
+    scores less in motion than a conservative one, and only command alignment pays it back. This
+    is the paper's definition; no weight is moved against it.
+    The constant default has 80 in every motion metric, being compared with itself, and full marks
+    for latency. Its scenario alignment is 0 here, because a tie is no success; the paper prints 60
+    for its baseline and does not say how a constant gets there. That is worth 9 points.
+    The time to collision is a threshold. In the lane change every style passes it (2.0 to 2.05 s:
+    30 m at 50 km/h, before the lead has gained speed), so there it tells no styles apart.
+    In the lane change and the left turn the simulated car holds its speed: SV_x and |a_x| lie below
+    their floors (paper: 3.91 and 0.37), and |J_x| is measurement noise times K_p.
 """
 
 import math
