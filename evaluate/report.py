@@ -7,10 +7,11 @@ python -m evaluate --config configs/evaluate.yaml
 """
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -18,8 +19,9 @@ import torch
 from ridetune.alignment import command_alignment
 from ridetune.awq_checkpoint import load_quantized
 from ridetune.bundle import Bundle, load_bundle
-from ridetune.contract import load_tokenizer
+from ridetune.contract import Contract, load_tokenizer
 from ridetune.engines import Engine
+from ridetune.gate import Outcome, SafetyGate
 from ridetune.matrix import ControllerMatrix
 from ridetune.ort_engine import OrtEngine
 from ridetune.policy import Policy, read_text
@@ -70,7 +72,7 @@ def evaluate(config: EvaluateConfig) -> None:
     )
     result["memory"] = score_memory(policy, samples, config, rng)
     result["scene"] = score_scenes(policy, some_of(samples, config.scene_samples))
-    result["gate"] = gate_outcomes(policy, some_of(samples, 600))
+    result["gate"] = gate_outcomes(served, policy.contract)
     result["peak_rss_mb"] = round(peak_rss_mb())
     config.out.parent.mkdir(parents=True, exist_ok=True)
     config.out.write_text(json.dumps(result, indent=2) + "\n")
@@ -167,7 +169,10 @@ def score_memory(
     return {
         kind: memory_shift(neutral, _remembering(policy, subset, sayings[kind], rng), codec)
         for kind in ("too_aggressive", "too_conservative")
-    } | {"against": "the same samples with just_right feedback", "sayings": len(sayings)}
+    } | {
+        "against": "the same samples with just_right feedback",
+        "sayings": sum(map(len, sayings.values())),
+    }
 
 
 def _remembering(
@@ -189,14 +194,11 @@ def score_scenes(policy: Policy, subset: Sequence[Sample]) -> dict[str, float]:
     return {name: round(float(s), 4) for name, s in zip(SCENE_QUESTIONS, shares, strict=True)}
 
 
-def gate_outcomes(policy: Policy, subset: Sequence[Sample]) -> dict[str, int]:
+def gate_outcomes(served: Sequence[ControllerMatrix], contract: Contract) -> dict[str, int]:
     """What the gate says of the proposals, starting from the default matrix."""
-    default = policy.contract.ranges.default
-    counts = {"accepted": 0, "limited": 0, "refused": 0}
-    for sample in subset:
-        decision = policy.decide(sample.observation.frame, sample.instruction, last_safe=default)
-        counts[decision.verdict.outcome] += 1
-    return counts
+    gate = SafetyGate(contract.ranges, contract.codec)
+    verdicts = Counter(gate.judge(m, contract.ranges.default).outcome for m in served)
+    return {outcome: verdicts[outcome] for outcome in get_args(Outcome)}
 
 
 def print_table(result: dict[str, Any]) -> None:

@@ -232,10 +232,13 @@ def test_matrix_written_as_text_is_read_back_and_scored(
     assert found["decisions"] == 4
 
 
-def test_gate_outcomes_add_up(policy: Policy, samples: list[Sample]) -> None:
-    counts = gate_outcomes(policy, samples[:6])
-    assert set(counts) == {"accepted", "limited", "refused"}
-    assert sum(counts.values()) == 6
+def test_gate_outcomes_tell_what_the_gate_does(policy: Policy) -> None:
+    contract = policy.contract
+    default = contract.ranges.default
+    far = replace(default, ws=contract.ranges.highest[-1])
+    outside = replace(default, kp=2 * contract.ranges.highest[0])
+    counts = gate_outcomes([default, far, outside, outside], contract)
+    assert counts == {"accepted": 1, "limited": 1, "refused": 2}
 
 
 def test_report_holds_every_score(
