@@ -78,7 +78,7 @@ $(RUN)/data/manifest.json: $(wildcard data/*.py data/bank/*.yaml ridetune/camera
 
 $(RUN)/merged/manifest.json: $(RUN)/data/manifest.json $(wildcard train/*.py) $(CONTRACT) \
 		ridetune/prompt.py ridetune/vision.py ridetune/contract.py ridetune/qwen.py \
-		configs/train.yaml $(wildcard $(BASE)/*) | $(INSTALLED)
+		configs/train.yaml $(wildcard $(BASE)/*.json $(BASE)/*.safetensors) | $(INSTALLED)
 	$(PY) -m train --config configs/train.yaml \
 		base=$(BASE) data=$(RUN)/data adapter=$(RUN)/adapter out=$(RUN)/merged
 

@@ -25,15 +25,16 @@ from ridetune.config import load_config
 from ridetune.contract import load_tokenizer
 from ridetune.control.vehicle import Vehicle
 from ridetune.gate import SafetyGate
+from ridetune.matrix import Style
 from ridetune.ort_engine import OrtEngine
 from ridetune.policy import Policy
 from ridetune.sample import ADVERSE, CONDITIONS, LEVELS, Condition, read_samples
 from ridetune.stage import run_stage
 
-from .driving_score import MANOEUVRES, METRICS, TABLE_1, DrivingScoreConfig
+from .driving_score import MANOEUVRES, METRICS, TABLE_1, DrivingScoreConfig, Manoeuvre
 from .loop_scores import align_conditions, cells, read_styles, score_arm, summarise
 from .passenger_trips import PassengerConfig, ride_with_passengers
-from .styles import drive_ranges, fit_readers, order_styles
+from .styles import SHOWN, drive_ranges, features_of, fit_readers, order_styles
 from .trials import Asking, Car, Drive, Trial, drive_arms, drive_served, plan_trials, sentences_of
 
 # What the issue asks for.
@@ -161,11 +162,19 @@ def against_paper(constant: Sequence[Drive]) -> dict[str, dict[str, float]]:
 
 
 def trajectories(served: Sequence[Drive]) -> list[dict[str, Any]]:
-    """The first drive of each manoeuvre and style in daylight, thinned, for a picture."""
-    chosen: dict[tuple[str, str], Drive] = {}
+    """The middle drive of each manoeuvre and style in daylight, thinned, for a picture.
+
+    Middle in what shows the style first: half of the drives were brisker, half calmer.
+    """
+    found: dict[tuple[Manoeuvre, Style], list[Drive]] = {}
     for drive in served:
-        if drive.condition == "sunny":
-            chosen.setdefault((drive.trial.manoeuvre, drive.trial.style), drive)
+        if drive.condition == "sunny" and not drive.metrics.failed:
+            found.setdefault((drive.trial.manoeuvre, drive.trial.style), []).append(drive)
+    chosen = []
+    for (manoeuvre, _), drives in found.items():
+        first = next(iter(SHOWN[manoeuvre]))
+        values = [features_of(d.metrics)[first] for d in drives]
+        chosen.append(drives[int(np.argsort(values)[len(drives) // 2])])
     return [
         {
             "manoeuvre": drive.trial.manoeuvre,
@@ -176,7 +185,7 @@ def trajectories(served: Sequence[Drive]) -> list[dict[str, Any]]:
             "signals": {name: _thin(drive.rollout.trajectory[name]) for name in _SIGNALS}
             | {"felt_lateral_mps2": _thin(drive.rollout.trajectory.felt_lateral_mps2)},
         }
-        for drive in chosen.values()
+        for drive in chosen
     ]
 
 

@@ -111,7 +111,7 @@ def closed_loop(result: Mapping[str, Any]) -> str:
         bars = [
             Bar(
                 "ours" if arm == "served" else "default",
-                _CONTROLS.get(arm, title(arm).lower()),
+                "oracle" if arm == "oracle" else _CONTROLS.get(arm, title(arm).lower()),
                 row["score"],
                 None,
                 f"{row['over_constant']:+.2f} over constant, standard error "
