@@ -66,7 +66,8 @@ def animations(shown: Shown) -> str:
         "of its style's ranges: no model takes part here."
         if shown.words is None
         else "The served bundle looks through the simulated car's camera, hears the words and "
-        "proposes; the gate lets through what is safe. Clear day."
+        "proposes; the gate lets through what is safe. Clear day; of each style the middle one of "
+        "its drives, for some words are misunderstood."
     )
     figures = "".join(_figure(manoeuvre, shown) for manoeuvre in MANOEUVRES)
     return f"<h2>Three manoeuvres from above</h2><p>{about}</p>{figures}"
