@@ -18,7 +18,9 @@ REPORT = $(addprefix evaluate/,__main__.py report.py alignment.py decisions.py)
 PAGE = $(wildcard evaluate/page_parts/*) $(addprefix evaluate/,page.py animation.py curves.py \
 	plots.py sections.py style_drives.py tables.py)
 SWEEP = $(addprefix evaluate/,sweep.py sweep_runs.py workers.py)
-LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP),$(wildcard evaluate/*.py))
+ENVELOPE = $(addprefix evaluate/,envelope.py envelope_plot.py gate_proof.py monte_carlo.py \
+	peeling.py stability.py switching.py)
+LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP) $(ENVELOPE),$(wildcard evaluate/*.py))
 SIMULATION = $(wildcard ridetune/control/*.py ridetune/sim/*.py) configs/ranges.yaml \
 	configs/vehicle.yaml
 CONTRACT = $(addprefix ridetune/,alignment.py codec.py config.py matrix.py sample.py stage.py)
@@ -28,7 +30,7 @@ export HF_HUB_OFFLINE = 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help venv data train quantize bench sweep evaluate serve demo test lint types clean
+.PHONY: help venv data train quantize bench sweep envelope evaluate serve demo test lint types clean
 
 help:  ## Print this list
 	@grep -E '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/^([a-z]+):[^#]*## /\1|/' \
@@ -41,6 +43,9 @@ quantize: $(RUN)/bundle/bundle.json  ## Quantize to 4-bit AWQ and export the bun
 bench: $(RUN)/evaluation.json  ## Profile the bundle's latency and score what it does
 sweep: $(RUN)/sweep.json  ## Drive 5,040 drawn matrices through every scenario and condition
 evaluate: $(RUN)/report.html  ## Drive, score, and write it all on one page
+
+envelope: $(INSTALLED)  ## Compute what the gate lets through anew (configs/verified.yaml, committed)
+	$(PY) -m evaluate.envelope --config configs/envelope.yaml
 
 serve: $(RUN)/.profiled  ## Serve the bundle on this machine (PORT=8470)
 	$(PY) -m serve --config configs/serve.yaml bundle=$(RUN)/bundle port=$(PORT)
@@ -96,18 +101,19 @@ $(RUN)/bundle/bundle.json: $(RUN)/awq/manifest.json $(EXPORT) \
 
 # The benchmark writes its profile into bundle.json, which makes that file newer than itself:
 # the stamp is touched afterwards, so that neither rule starts the other again.
-$(RUN)/.profiled: $(RUN)/bundle/bundle.json $(BENCHMARK) configs/benchmark.yaml \
+$(RUN)/.profiled: $(RUN)/bundle/bundle.json $(BENCHMARK) configs/benchmark.yaml configs/verified.yaml \
 		| $(INSTALLED)
 	$(PY) -m quantize.benchmark --config configs/benchmark.yaml \
 		bundle=$(RUN)/bundle data=$(RUN)/data run=$(RUN) out=$(RUN)/profile
 	@touch $@
 
-$(RUN)/evaluation.json: $(RUN)/.profiled $(REPORT) $(LIBRARY) configs/evaluate.yaml | $(INSTALLED)
+$(RUN)/evaluation.json: $(RUN)/.profiled $(REPORT) $(LIBRARY) configs/evaluate.yaml configs/verified.yaml \
+		| $(INSTALLED)
 	$(PY) -m evaluate --config configs/evaluate.yaml bundle=$(RUN)/bundle data=$(RUN)/data \
 		merged=$(RUN)/merged quantized=$(RUN)/awq out=$@
 
 $(RUN)/closed_loop.json: $(RUN)/.profiled $(LOOP) $(LIBRARY) configs/closed_loop.yaml \
-		configs/driving_score.yaml configs/vehicle.yaml | $(INSTALLED)
+		configs/driving_score.yaml configs/vehicle.yaml configs/verified.yaml | $(INSTALLED)
 	$(PY) -m evaluate.closed_loop --config configs/closed_loop.yaml bundle=$(RUN)/bundle \
 		data=$(RUN)/data out=$@
 

@@ -24,18 +24,29 @@ from ridetune.bundle import load_bundle
 from ridetune.config import load_config
 from ridetune.contract import load_tokenizer
 from ridetune.control.vehicle import Vehicle
-from ridetune.gate import SafetyGate
 from ridetune.matrix import Style
 from ridetune.ort_engine import OrtEngine
 from ridetune.policy import Policy
 from ridetune.sample import ADVERSE, CONDITIONS, LEVELS, Condition, read_samples
+from ridetune.sim.check import load_gate
 from ridetune.stage import run_stage
 
 from .driving_score import MANOEUVRES, METRICS, TABLE_1, DrivingScoreConfig, Manoeuvre
 from .loop_scores import align_conditions, cells, read_styles, score_arm, summarise
 from .passenger_trips import PassengerConfig, ride_with_passengers
 from .styles import SHOWN, drive_ranges, features_of, fit_readers, order_styles
-from .trials import Asking, Car, Drive, Trial, drive_arms, drive_served, plan_trials, sentences_of
+from .trials import (
+    Asking,
+    Car,
+    Drive,
+    Trial,
+    drive_arms,
+    drive_served,
+    drive_written,
+    plan_trials,
+    sentences_of,
+)
+from .writing import MatrixWriter
 
 # What the issue asks for.
 LEAST_STYLE_READ, LEAST_SCENARIO_ALIGNMENT, MOST_OFF_PAPER = 0.8, 0.9, 0.15
@@ -52,6 +63,7 @@ class ClosedLoopConfig:
     bundle: Path
     data: Path
     vehicle: Path
+    envelope: Path
     driving_score: Path
     out: Path
     seed: int
@@ -67,17 +79,16 @@ def run(config: ClosedLoopConfig) -> None:
     rng = np.random.default_rng(config.seed)
     bundle = load_bundle(config.bundle)
     contract = bundle.contract
-    policy = Policy(
-        OrtEngine(bundle, threads=config.threads), contract, load_tokenizer(config.bundle)
-    )
-    car = Car(
-        Vehicle.load(config.vehicle),
-        SafetyGate(contract.ranges, contract.codec),
-        contract.ranges.default,
-        config.asking,
-    )
+    engine = OrtEngine(bundle, threads=config.threads)
+    tokenizer = load_tokenizer(config.bundle)
+    policy = Policy(engine, contract, tokenizer)
+    writer = MatrixWriter(engine, contract, tokenizer)
+    vehicle = Vehicle.load(config.vehicle)
+    gate = load_gate(contract, vehicle, config.envelope)
+    car = Car(vehicle, gate, contract.ranges.default, config.asking)
     sentences = sentences_of(read_samples(config.data / "test.parquet"))
-    result = drive_manoeuvres(config, policy, car, plan_trials(sentences, config.trials, rng), rng)
+    trials = plan_trials(sentences, config.trials, rng)
+    result = drive_manoeuvres(config, policy, writer, car, trials, rng)
     result["takeovers"] = ride_with_passengers(
         config.passengers, config.data, policy, car, sentences
     )
@@ -93,16 +104,15 @@ def run(config: ClosedLoopConfig) -> None:
 def drive_manoeuvres(
     config: ClosedLoopConfig,
     policy: Policy,
+    writer: MatrixWriter,
     car: Car,
     trials: Sequence[Trial],
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """All arms on all trials, and what they show."""
-    codec, score_config = (
-        policy.contract.codec,
-        load_config(DrivingScoreConfig, config.driving_score),
-    )
-    bar = tqdm(total=len(CONDITIONS) * len(trials), desc="served drives", unit="drive")
+    codec = policy.contract.codec
+    score_config = load_config(DrivingScoreConfig, config.driving_score)
+    bar = tqdm(total=2 * len(CONDITIONS) * len(trials), desc="served drives", unit="drive")
     seconds = []
 
     def serve(trial: Trial, condition: Condition) -> Drive:
@@ -112,14 +122,22 @@ def drive_manoeuvres(
         bar.update()
         return drive
 
-    arms = drive_arms(serve, trials, car, policy, rng)
+    def write(trial: Trial, condition: Condition) -> Drive:
+        bar.update()
+        return drive_written(writer, trial, condition, car)
+
+    arms = drive_arms({"served": serve, "text": write}, trials, car, codec, rng)
     bar.close()
     ranges = drive_ranges(trials, 2 * config.range_drives, car, codec, rng)
     readers = fit_readers(ranges[::2])
-    latency = config.asking.latency_s
+    waits = {"constant": 0.0, "text": config.asking.text_latency_s}
     scored = {
         arm: score_arm(
-            drives, arms["constant"], 0.0 if arm == "constant" else latency, codec, score_config
+            drives,
+            arms["constant"],
+            waits.get(arm, config.asking.latency_s),
+            codec,
+            score_config,
         )
         for arm, drives in arms.items()
     }

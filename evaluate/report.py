@@ -19,23 +19,22 @@ import torch
 from ridetune.alignment import command_alignment
 from ridetune.awq_checkpoint import load_quantized
 from ridetune.bundle import Bundle, load_bundle
-from ridetune.contract import Contract, load_tokenizer
-from ridetune.engines import Engine
+from ridetune.contract import load_tokenizer
+from ridetune.control.vehicle import Vehicle
 from ridetune.gate import Outcome, SafetyGate
-from ridetune.matrix import ControllerMatrix
+from ridetune.matrix import ControllerMatrix, Ranges
 from ridetune.ort_engine import OrtEngine
-from ridetune.policy import Policy, read_text
+from ridetune.policy import Policy
 from ridetune.qwen import load_model
 from ridetune.sample import Sample, read_samples, some_of
 from ridetune.scene import SCENE_QUESTIONS, scene_answers
+from ridetune.sim.check import load_gate
 from ridetune.stage import peak_rss_mb
 from ridetune.torch_engine import TorchEngine
-from ridetune.vision import read_patches
 
 from .alignment import agreement, memory_shift, past_drive, score
 from .decisions import propose, random_matrices, shuffle_frames, shuffle_instructions
-
-MAX_MATRIX_TOKENS = 80
+from .writing import MatrixWriter
 
 
 @dataclass(frozen=True)
@@ -46,6 +45,8 @@ class EvaluateConfig:
     data: Path
     merged: Path
     quantized: Path
+    vehicle: Path
+    envelope: Path
     out: Path
     seed: int
     threads: int
@@ -67,12 +68,13 @@ def evaluate(config: EvaluateConfig) -> None:
     result: dict[str, Any] = {"served": score(served, samples, policy.contract.codec)}
     result["controls"] = score_controls(policy, samples, rng)
     result["torch"] = compare_torch(config, bundle, samples, served)
-    result["text"] = score_text(
-        engine, bundle, some_of(samples, config.text_samples), served, samples
-    )
+    writer = MatrixWriter(engine, bundle.contract, load_tokenizer(config.bundle))
+    subset = some_of(samples, config.text_samples)
+    result["text"] = score_text(writer, subset, served, samples, bundle.contract.ranges)
     result["memory"] = score_memory(policy, samples, config, rng)
     result["scene"] = score_scenes(policy, some_of(samples, config.scene_samples))
-    result["gate"] = gate_outcomes(served, policy.contract)
+    gate = load_gate(bundle.contract, Vehicle.load(config.vehicle), config.envelope)
+    result["gate"] = gate_outcomes(served, samples, gate)
     result["peak_rss_mb"] = round(peak_rss_mb())
     config.out.parent.mkdir(parents=True, exist_ok=True)
     config.out.write_text(json.dumps(result, indent=2) + "\n")
@@ -123,25 +125,18 @@ def compare_torch(
 
 
 def score_text(
-    engine: Engine,
-    bundle: Bundle,
+    writer: MatrixWriter,
     subset: Sequence[Sample],
     served: Sequence[ControllerMatrix],
     samples: Sequence[Sample],
+    ranges: Ranges,
 ) -> dict[str, Any]:
     """The paper's way on the same bundle: the matrix as text, token by token."""
-    contract, tokenizer = bundle.contract, load_tokenizer(bundle.folder)
-    prompts, codec = contract.prompts(tokenizer), contract.codec
     proposal_of = {id(sample): matrix for sample, matrix in zip(samples, served, strict=True)}
     text_scores, bin_scores, tokens = [], [], []
     for sample in subset:
-        prefix = engine.prefill(read_patches(sample.observation.frame, contract.vision))
-        ids = engine.write_matrix(
-            prefix, prompts.suffix(sample.instruction, sample.memories), MAX_MATRIX_TOKENS
-        )
-        tokens.append(len(ids))
-        matrix = codec.parse(read_text(tokenizer, ids))
-        ranges = codec.ranges
+        matrix, count = writer.write(sample.observation.frame, sample.instruction, sample.memories)
+        tokens.append(count)
         text_scores.append(
             command_alignment(matrix, sample.style, ranges) if matrix is not None else None
         )
@@ -194,10 +189,14 @@ def score_scenes(policy: Policy, subset: Sequence[Sample]) -> dict[str, float]:
     return {name: round(float(s), 4) for name, s in zip(SCENE_QUESTIONS, shares, strict=True)}
 
 
-def gate_outcomes(served: Sequence[ControllerMatrix], contract: Contract) -> dict[str, int]:
-    """What the gate says of the proposals, starting from the default matrix."""
-    gate = SafetyGate(contract.ranges, contract.codec)
-    verdicts = Counter(gate.judge(m, contract.ranges.default).outcome for m in served)
+def gate_outcomes(
+    served: Sequence[ControllerMatrix], samples: Sequence[Sample], gate: SafetyGate
+) -> dict[str, int]:
+    """What the gate says of each proposal in its condition, from a last safe matrix beside it."""
+    verdicts = Counter(
+        gate.judge(matrix, matrix, sample.condition).outcome
+        for matrix, sample in zip(served, samples, strict=True)
+    )
     return {outcome: verdicts[outcome] for outcome in get_args(Outcome)}
 
 

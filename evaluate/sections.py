@@ -17,6 +17,7 @@ from .tables import Numbers, table, title
 
 _CONTROLS = {
     "served": "served bundle",
+    "text": "matrix as text",
     "constant": "constant default",
     "random": "random matrix",
     "shuffled": "shuffled words",
@@ -93,10 +94,10 @@ def loop_rows(closed_loop: Mapping[str, Any]) -> dict[Manoeuvre, dict[str, Numbe
 
 
 def text_way(evaluation: Mapping[str, Any], profile: Mapping[str, Any]) -> str:
-    """What is known of the matrix written as text, which no drive waits for."""
+    """What the matrix written as text costs and gives, decision by decision."""
     text, ms = evaluation["text"], profile["as_text_ms"]
     return (
-        f'<p class="note">The matrix as text, the paper\'s way, was decided but not driven: over '
+        f'<p class="note">The matrix as text, the paper\'s way: over '
         f"{text['decisions']} decisions {100 * text['well_formed']:.1f} % are well formed and "
         f"align {text['command_alignment_text']:.1f}, the bins of the same decisions "
         f"{text['command_alignment_bins']:.1f}; decoding takes {ms['p50']:.1f} ms in the median, "
@@ -184,6 +185,7 @@ def latency(profile: Mapping[str, Any]) -> str:
         ("warm_ms", "warm: words to gated matrix, frame prefilled"),
         ("parallel_ms", "decoding: six bins in one pass"),
         ("as_text_ms", "decoding: matrix as text, the paper's way"),
+        ("full_gate_ms", "a served car's gate: verified envelope and rollout check"),
     )
     body = "".join(
         f'<tr><th scope="row">{name}</th>'

@@ -4,6 +4,7 @@ In: a plan of trials, a source of matrices for each arm. Out: a `Drive` per tria
 with what was proposed and what came of it. The arms:
 
     served     the bundle reads the frame and the words, a few times a drive
+    text       the same bundle writes the matrix as text, the paper's way
     constant   the vehicle's default matrix, whatever is said
     random     six uniform bins, drawn for each drive
     shuffled   what the bundle proposed in the same manoeuvre and weather on other words
@@ -18,6 +19,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from ridetune.codec import MatrixCodec
 from ridetune.control.vehicle import Vehicle
 from ridetune.gate import SafetyGate
 from ridetune.matrix import STYLES, ControllerMatrix, Style
@@ -32,8 +34,9 @@ from ridetune.sim.view import photograph
 
 from .decisions import random_matrices
 from .driving_score import Manoeuvre
+from .writing import MatrixWriter
 
-Arm = Literal["served", "constant", "random", "shuffled", "oracle"]
+Arm = Literal["served", "text", "constant", "random", "shuffled", "oracle"]
 ARMS: tuple[Arm, ...] = get_args(Arm)
 
 
@@ -43,12 +46,14 @@ class Asking:
 
     every_s: between two questions. looks: how many of them it reads a frame for; behind these its
     last proposal is repeated, as a passenger speaks once a trip. latency_s: from a question to its
-    answer, a stated constant, so that a busy machine does not change a drive.
+    answer, a stated constant, so that a busy machine does not change a drive; text_latency_s: the
+    same where the matrix is written as text.
     """
 
     every_s: float
     looks: int
     latency_s: float
+    text_latency_s: float
 
 
 @dataclass(frozen=True)
@@ -146,15 +151,38 @@ def sentences_of(samples: Sequence[Sample]) -> dict[tuple[Style, Level], list[st
 
 
 def drive_served(policy: Policy, trial: Trial, condition: Condition, car: Car) -> Drive:
-    """One drive with the bundle in the loop; it sees what the camera would see."""
+    """One drive with the bundle in the loop, the six bins decided in one pass."""
+
+    def propose(frame: bytes, kept: ControllerMatrix) -> ControllerMatrix:
+        return policy.decide(frame, trial.instruction, last_safe=kept, condition=condition).proposal
+
+    return _drive_asked(propose, car.asking.latency_s, trial, condition, car)
+
+
+def drive_written(writer: MatrixWriter, trial: Trial, condition: Condition, car: Car) -> Drive:
+    """One drive with the matrix as text; where the text holds none the car keeps its own."""
+
+    def propose(frame: bytes, kept: ControllerMatrix) -> ControllerMatrix:
+        return writer.write(frame, trial.instruction)[0] or kept
+
+    return _drive_asked(propose, car.asking.text_latency_s, trial, condition, car)
+
+
+def _drive_asked(
+    propose: Callable[[bytes, ControllerMatrix], ControllerMatrix],
+    latency_s: float,
+    trial: Trial,
+    condition: Condition,
+    car: Car,
+) -> Drive:
+    """One drive of a model that sees what the camera would see."""
     proposals: list[ControllerMatrix] = []
 
     def source(moment: Moment) -> Answer:
         if len(proposals) < car.asking.looks:
             frame = photograph(moment, trial.scenario, condition, trial.street)
-            decision = policy.decide(frame, trial.instruction, last_safe=moment.matrix)
-            proposals.append(decision.proposal)
-        return Answer(proposals[-1], car.asking.latency_s)
+            proposals.append(propose(frame, moment.matrix))
+        return Answer(proposals[-1], latency_s)
 
     rollout, metrics = car.drive(source, trial, condition)
     return Drive(trial, condition, tuple(proposals), rollout, metrics)
@@ -174,16 +202,20 @@ def drive_proposals(
 
 
 def drive_arms(
-    serve: Callable[[Trial, Condition], Drive],
+    asked: Mapping[Arm, Callable[[Trial, Condition], Drive]],
     trials: Sequence[Trial],
     car: Car,
-    policy: Policy,
+    codec: MatrixCodec,
     rng: np.random.Generator,
 ) -> dict[Arm, list[Drive]]:
-    """Every arm on every trial in every condition, in the same order."""
-    codec, priors = policy.contract.codec, Priors()
+    """Every arm on every trial in every condition, in the same order.
+
+    asked: how the arms drive in which a model is asked; "served" must be among them.
+    """
+    priors = Priors()
     everywhere = [(trial, condition) for trial in trials for condition in CONDITIONS]
-    served = [serve(trial, condition) for trial, condition in everywhere]
+    arms = {arm: [drive(*place) for place in everywhere] for arm, drive in asked.items()}
+    served = arms["served"]
     other = _other_words(trials, rng)
     place = {(id(d.trial), d.condition): d for d in served}
     drawn = random_matrices(len(everywhere), codec, rng)
@@ -196,7 +228,6 @@ def drive_arms(
             for t, c in everywhere
         ],
     }
-    arms: dict[Arm, list[Drive]] = {"served": served}
     for arm, given in proposals.items():
         arms[arm] = [
             drive_proposals(p, trial, condition, car)

@@ -19,7 +19,7 @@ from ridetune.contract import Contract
 from ridetune.engines import ActionPass, Engine, Prefix
 from ridetune.gate import SafetyGate, Verdict
 from ridetune.matrix import ControllerMatrix
-from ridetune.sample import Memory
+from ridetune.sample import Condition, Memory
 from ridetune.vision import read_patches
 
 MAX_EXPLANATION_TOKENS = 96
@@ -72,7 +72,10 @@ class Explanation:
 
 
 class Policy:
-    """One model behind one gate; `clock` is monotonic [s]."""
+    """One model behind one gate; `clock` is monotonic [s].
+
+    gate: one of the bundle's ranges alone if not given; a car's has envelope and check as well.
+    """
 
     def __init__(
         self,
@@ -80,6 +83,7 @@ class Policy:
         contract: Contract,
         tokenizer: Tokenizer,
         *,
+        gate: SafetyGate | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.contract = contract
@@ -87,7 +91,7 @@ class Policy:
         self._tokenizer = tokenizer
         self._codec = contract.codec
         self._prompts = contract.prompts(tokenizer)
-        self._gate = SafetyGate(contract.ranges, self._codec)
+        self._gate = SafetyGate(contract.ranges, self._codec) if gate is None else gate
         self._clock = clock
 
     def prepare(self, frame: bytes, *, captured_s: float | None = None) -> PreparedFrame:
@@ -110,12 +114,14 @@ class Policy:
         memories: Sequence[Memory] = (),
         *,
         last_safe: ControllerMatrix,
+        condition: Condition | None = None,
         captured_s: float | None = None,
     ) -> Decision:
         """One decision; FrameError or InstructionError if the input is unusable.
 
+        condition: of the road, from the car's own sensors, for the gate; None if not known.
         captured_s: as in `prepare`, for a frame given as bytes. A memory whose matrix lies
-        outside the envelope is a ValueError.
+        outside the vehicle's ranges is a ValueError.
         """
         watch = _Laps(self._clock)
         if isinstance(frame, bytes):
@@ -126,7 +132,7 @@ class Policy:
         action_pass = self._engine.decide(frame.prefix, suffix)
         proposal, confidence = self._codec.expect(action_pass.logits)
         watch.lap("decide")
-        verdict = self._gate.judge(proposal, last_safe)
+        verdict = self._gate.judge(proposal, last_safe, condition)
         watch.lap("gate")
         return Decision(
             proposal=proposal,

@@ -27,7 +27,7 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 def serve(config: ServeConfig) -> None:
     """Serve until SIGTERM or Ctrl-C; ValueError if the bundle or the port cannot be had."""
-    load = partial(load_served, config.bundle, config.threads)
+    load = partial(load_served, config.bundle, config.threads, config.vehicle, config.envelope)
     worker = InferenceWorker(load, explanation_s=config.explanation_s)
     try:
         worker.start()

@@ -53,7 +53,8 @@ Count = Annotated[int, Field(ge=1)]
 class ServeConfig:
     """How to serve. deadline_s: until the matrix; explanation_s: from there to the explanation.
 
-    port 0 takes a free one. queue: requests at once, the next one is sent away.
+    port 0 takes a free one. queue: requests at once, the next one is sent away. vehicle, envelope:
+    what the gate verifies proposals with.
     """
 
     bundle: Path
@@ -64,6 +65,8 @@ class ServeConfig:
     explanation_s: Positive
     max_sessions: Count
     queue: Count
+    vehicle: Path = Path("configs/vehicle.yaml")
+    envelope: Path = Path("configs/verified.yaml")
 
 
 class Sessions:
@@ -136,8 +139,14 @@ class Desk:
         return self._answer(reply, session)
 
     async def _ask(self, question: Question, session: str, arrived_s: float) -> Reply:
-        last_safe = self.sessions.last_safe(session)
-        job = Job(question.frame, question.instruction, question.memories, last_safe, arrived_s)
+        job = Job(
+            question.frame,
+            question.instruction,
+            question.memories,
+            self.sessions.last_safe(session),
+            question.condition,
+            arrived_s,
+        )
         until_s = arrived_s + self._config.deadline_s
         try:
             reply = await asyncio.to_thread(self.worker.decide, job, until_s=until_s)

@@ -18,6 +18,7 @@ from typing import IO, Annotated, Any
 import httpx
 from pydantic import Field, TypeAdapter
 
+from ridetune.sample import Condition
 from ridetune.stage import run_stage
 
 from .__main__ import listen
@@ -39,27 +40,32 @@ _DECISION = TypeAdapter(DecisionOut)
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """What to ask about; `frames` is a folder, or empty for a frame of the dataset `data`."""
+    """What to ask about; `frames` is a folder, or empty for a frame of the dataset `data`.
+
+    condition: of the road on the frames of the folder, for the gate; None if it is not known.
+    """
 
     bundle: Path
     data: Path
     frames: str | None
     max_frames: Annotated[int, Field(ge=1)] | None
+    condition: Condition | None
     port: Annotated[int, Field(ge=0, le=65535)]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """An encoded image and what to call it."""
+    """An encoded image, what to call it, and the condition of the road where it is known."""
 
     name: str
     content: bytes
+    condition: Condition | None
 
 
 def demo(config: DemoConfig) -> None:
     """Print three answers per frame; ValueError if there is no frame or no server to be had."""
     if config.frames:
-        frames = folder_frames(Path(config.frames), config.max_frames or 6)
+        frames = folder_frames(Path(config.frames), config.max_frames or 6, config.condition)
     else:
         frames = dataset_frames(config.data, config.max_frames or 1)
     unusable: list[str] = []
@@ -78,7 +84,7 @@ def demo(config: DemoConfig) -> None:
         raise ValueError("no frame was usable; set frames=<a folder of JPEG or PNG camera images>")
 
 
-def folder_frames(folder: Path, count: int) -> list[Frame]:
+def folder_frames(folder: Path, count: int, condition: Condition | None) -> list[Frame]:
     """Up to `count` images, spread evenly over the sub-folders; ValueError if there is none."""
     if not folder.is_dir():
         raise ValueError(f"no folder at {folder}; set frames=<a folder of camera images>")
@@ -92,7 +98,7 @@ def folder_frames(folder: Path, count: int) -> list[Frame]:
             "set frames=<a folder of camera images>"
         )
     chosen = pick_evenly(list(groups.values()), count)
-    return [Frame(str(path.relative_to(folder)), path.read_bytes()) for path in chosen]
+    return [Frame(str(path.relative_to(folder)), path.read_bytes(), condition) for path in chosen]
 
 
 def pick_evenly(groups: list[list[Path]], count: int) -> list[Path]:
@@ -122,7 +128,7 @@ def dataset_frames(data: Path, count: int) -> list[Frame]:
             found.setdefault(name, table["image"][row].as_py()["bytes"])
     if not found:
         raise ValueError(f"{path} holds no sunny frame; build it with `python -m data`")
-    return [Frame(f"{name}, rendered, sunny", content) for name, content in found.items()]
+    return [Frame(f"{name}, rendered, sunny", content, "sunny") for name, content in found.items()]
 
 
 @contextmanager
@@ -179,10 +185,9 @@ def _last_error(log: IO[str]) -> str:
 def _show_answers(client: httpx.Client, frame: Frame) -> str | None:
     """Print the answers on a frame, or return why there is none."""
     for question in QUESTIONS:
+        asked = {"instruction": question, "condition": frame.condition or ""}
         try:
-            answer = client.post(
-                "/v1/decide", data={"instruction": question}, files={"frame": frame.content}
-            )
+            answer = client.post("/v1/decide", data=asked, files={"frame": frame.content})
         except httpx.TransportError as error:
             return f"the server gave no answer ({type(error).__name__})"
         if answer.status_code != 200:

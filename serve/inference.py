@@ -18,11 +18,12 @@ import cv2
 import numpy as np
 
 from ridetune.contract import Contract, load_tokenizer
+from ridetune.control.vehicle import Vehicle
 from ridetune.gate import Verdict
 from ridetune.matrix import ControllerMatrix
 from ridetune.policy import Policy
 from ridetune.prompt import InstructionError
-from ridetune.sample import Memory
+from ridetune.sample import Condition, Memory
 from ridetune.vision import FrameError
 
 
@@ -36,12 +37,16 @@ class Served:
 
 @dataclass(frozen=True)
 class Job:
-    """One question to the model; captured_s is monotonic, which processes share on Linux [s]."""
+    """One question to the model; captured_s is monotonic, which processes share on Linux [s].
+
+    condition: of the road, for the gate; None if not known.
+    """
 
     frame: bytes
     instruction: str
     memories: tuple[Memory, ...]
     last_safe: ControllerMatrix
+    condition: Condition | None
     captured_s: float
 
 
@@ -78,14 +83,20 @@ class Fault:
     sentence: str
 
 
-def load_served(bundle: Path, threads: int) -> Served:
-    """The policy on a bundle folder; ValueError if it is missing or was tampered with."""
+def load_served(bundle: Path, threads: int, vehicle: Path, envelope: Path) -> Served:
+    """The policy on a bundle folder, its gate with envelope and rollout check.
+
+    ValueError if a file is missing, was tampered with or belongs to another vehicle. The gate
+    drives the default matrix when it is made, so its simulation is compiled before `Warm`.
+    """
     from ridetune.bundle import load_bundle
     from ridetune.ort_engine import OrtEngine
+    from ridetune.sim.check import load_gate
 
     loaded = load_bundle(bundle)
     engine = OrtEngine(loaded, threads=threads)
-    policy = Policy(engine, loaded.contract, load_tokenizer(loaded.folder))
+    gate = load_gate(loaded.contract, Vehicle.load(vehicle), envelope)
+    policy = Policy(engine, loaded.contract, load_tokenizer(loaded.folder), gate=gate)
     content = json.dumps([loaded.facts.contract, loaded.facts.files], sort_keys=True)
     digest = hashlib.sha256(content.encode()).hexdigest()
     return Served(policy, f"{bundle.resolve().name}-{digest[:12]}")
@@ -128,6 +139,7 @@ def _answer(pipe: Connection, policy: Policy, job: Job) -> None:
             job.instruction,
             job.memories,
             last_safe=job.last_safe,
+            condition=job.condition,
             captured_s=job.captured_s,
         )
     except (FrameError, InstructionError) as error:

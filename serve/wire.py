@@ -19,13 +19,13 @@ from starlette.requests import ClientDisconnect
 from ridetune.gate import Outcome
 from ridetune.matrix import ControllerMatrix
 from ridetune.prompt import MAX_INSTRUCTION_CHARACTERS, MAX_MEMORIES
-from ridetune.sample import Memory
+from ridetune.sample import CONDITIONS, Condition, Memory
 from ridetune.vision import MAX_BYTES
 
 MAX_BODY_BYTES = MAX_BYTES + 256 * 1024
 MAX_FIELD_BYTES = 64 * 1024
 BODY_S = 10.0
-_FIELDS = ("frame", "instruction", "memories", "session")
+_FIELDS = ("frame", "instruction", "memories", "session", "condition")
 
 Rows = list[list[float | None]]
 
@@ -69,17 +69,22 @@ class MemoryIn(BaseModel):
 
 
 _MEMORIES = TypeAdapter(Annotated[list[MemoryIn], Field(max_length=MAX_MEMORIES)])
+_CONDITION: TypeAdapter[Condition] = TypeAdapter(Condition)
 _SESSION = TypeAdapter(Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")])
 
 
 @dataclass(frozen=True)
 class Question:
-    """A checked request; the frame is not decoded yet. session is empty for a new one."""
+    """A checked request; the frame is not decoded yet. session is empty for a new one.
+
+    condition: what the car's own sensors say of the road; None if they say nothing.
+    """
 
     frame: bytes
     instruction: str
     memories: tuple[Memory, ...]
     session: str
+    condition: Condition | None
 
 
 class VerdictOut(BaseModel):
@@ -162,6 +167,7 @@ async def read_question(request: Request) -> Question:
             instruction=_text(form, "instruction", required=True),
             memories=_memories(_text(form, "memories")),
             session=_session(_text(form, "session")),
+            condition=_condition(_text(form, "condition")),
         )
     finally:
         await form.close()
@@ -243,6 +249,17 @@ def _session(text: str) -> str:
     except ValidationError as error:
         raise RequestError(
             422, "session must be 1 to 64 letters, digits, dots, dashes or underscores"
+        ) from error
+
+
+def _condition(text: str) -> Condition | None:
+    if not text:
+        return None
+    try:
+        return _CONDITION.validate_python(text)
+    except ValidationError as error:
+        raise RequestError(
+            422, f"condition must be one of {', '.join(CONDITIONS)}, or left out if not known"
         ) from error
 
 

@@ -78,6 +78,7 @@ def test_profile_holds_every_latency_in_rising_quantiles(profile: dict[str, Any]
         ("warm_ms", 4),
         ("parallel_ms", 2),
         ("as_text_ms", 2),
+        ("full_gate_ms", 4),
     ):
         row = profile[name]
         assert 0 < row["p50"] <= row["p90"] <= row["p99"] <= row["max"]

@@ -22,10 +22,12 @@ from evaluate.trials import (
     drive_arms,
     drive_proposals,
     drive_served,
+    drive_written,
     plan_trials,
     sentences_of,
 )
 from evaluate.trips import Sentences, Setting
+from evaluate.writing import MatrixWriter
 from ridetune.codec import MatrixCodec
 from ridetune.config import load_config
 from ridetune.engines import ActionPass, Prefix
@@ -49,7 +51,7 @@ from tests.shipped_car import DEFAULT, RANGES, VEHICLE, middle
 
 CODEC = MatrixCodec(RANGES)
 GATE = SafetyGate(RANGES, CODEC)
-CAR = Car(VEHICLE, GATE, DEFAULT, Asking(every_s=2.0, looks=2, latency_s=0.05))
+CAR = Car(VEHICLE, GATE, DEFAULT, Asking(every_s=2.0, looks=2, latency_s=0.05, text_latency_s=0.2))
 WORDS = {(style, level): [f"{style} {level}"] for style in STYLES for level in LEVELS}
 
 
@@ -68,6 +70,18 @@ class Listening(FakeEngine):
         return super().decide(prefix, suffix)
 
 
+class Scribe(MatrixWriter):
+    """Writes what it is told to, one text a question."""
+
+    def __init__(self, written: list[ControllerMatrix | None]) -> None:
+        self.written = written
+
+    def write(
+        self, frame: bytes, instruction: str, memories: Sequence[Memory] = ()
+    ) -> tuple[ControllerMatrix | None, int]:
+        return self.written.pop(0), 30
+
+
 def policy(engine: FakeEngine) -> Policy:
     return Policy(engine, CONTRACT, TOKENIZER)
 
@@ -82,7 +96,7 @@ def serve_taste(trial: Trial, condition: Condition) -> Drive:
 def arms() -> dict[Any, list[Drive]]:
     rng = np.random.default_rng(0)
     trials = plan_trials(WORDS, 1, rng)
-    return drive_arms(serve_taste, trials, CAR, policy(Listening()), rng)
+    return drive_arms({"served": serve_taste, "text": serve_taste}, trials, CAR, CODEC, rng)
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +117,16 @@ def test_the_policy_sees_the_drive_as_it_goes_and_is_asked_as_often_as_said() ->
     )
 
 
+def test_a_matrix_written_as_text_drives_and_without_one_the_car_keeps_its_own() -> None:
+    asked = middle("aggressive")
+    trial = Trial("acceleration", ACCELERATION, "aggressive", "I", "hurry", 2, 7)
+    drive = drive_written(Scribe([asked, None]), trial, "sunny", CAR)
+    assert drive.proposals == (asked, GATE.judge(asked, DEFAULT, "sunny").matrix)
+
+
 def test_all_arms_drive_the_same_trials() -> None:
     places = {arm: [(id(d.trial), d.condition) for d in drives] for arm, drives in arms().items()}
-    assert len(places) == 5 and len(set(map(tuple, places.values()))) == 1
+    assert len(places) == 6 and len(set(map(tuple, places.values()))) == 1
     assert len(places["served"]) == 3 * 3 * len(CONDITIONS)
     assert {d.proposals for d in arms()["constant"]} == {(DEFAULT,)}
 

@@ -13,15 +13,18 @@ import pytest
 from evaluate.alignment import agreement, clear_adverse_pairs, memory_shift, past_drive, score
 from evaluate.decisions import propose, random_matrices, shuffle_frames, shuffle_instructions
 from evaluate.report import EvaluateConfig, evaluate, gate_outcomes, score_text
+from evaluate.writing import MatrixWriter
 from ridetune.bundle import Bundle, load_bundle
 from ridetune.codec import MatrixCodec
 from ridetune.contract import Contract, load_tokenizer
+from ridetune.control.vehicle import Vehicle
 from ridetune.engines import Engine
 from ridetune.matrix import STYLES, ControllerMatrix, Ranges, Style
 from ridetune.ort_engine import OrtEngine
 from ridetune.policy import Policy
 from ridetune.sample import ADVERSE, Observation, Sample, read_samples
 from ridetune.scene import SCENE_QUESTIONS
+from ridetune.sim.check import load_gate
 from ridetune.stage import run_stage
 from tests.small_base import RANGES, small_base, small_data
 from tests.tiny_bundle import awq_bundle, awq_model, plain_model
@@ -225,19 +228,22 @@ def test_matrix_written_as_text_is_read_back_and_scored(
     told = [prompts.text(codec.text(s.matrix)) for s in subset]
     told[3] = told[3][:20]  # breaks off
     engine = cast(Engine, Scribe(told))
-    found = score_text(engine, bundle, subset, served[:4], subset)
+    writer = MatrixWriter(engine, bundle.contract, load_tokenizer(bundle.folder))
+    found = score_text(writer, subset, served[:4], subset, codec.ranges)
     assert found["well_formed"] == 0.75
     assert found["command_alignment_text"] == pytest.approx(75, abs=0.5)
     assert found["command_alignment_bins"] < 99
     assert found["decisions"] == 4
 
 
-def test_gate_outcomes_tell_what_the_gate_does(policy: Policy) -> None:
+def test_gate_outcomes_tell_what_the_gate_does(policy: Policy, samples: list[Sample]) -> None:
     contract = policy.contract
+    vehicle = Vehicle.load(RANGES.with_name("vehicle.yaml"))
+    gate = load_gate(contract, vehicle, RANGES.with_name("verified.yaml"))
     default = contract.ranges.default
-    far = replace(default, ws=contract.ranges.highest[-1])
+    calm = replace(default, wl=contract.ranges.lowest[3])
     outside = replace(default, kp=2 * contract.ranges.highest[0])
-    counts = gate_outcomes([default, far, outside, outside], contract)
+    counts = gate_outcomes([default, calm, outside, outside], samples[:4], gate)
     assert counts == {"accepted": 1, "limited": 1, "refused": 2}
 
 

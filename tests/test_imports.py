@@ -22,6 +22,7 @@ LIGHT = (
     "config",
     "contract",
     "engines",
+    "envelope",
     "gate",
     "matrix",
     "policy",
@@ -39,6 +40,7 @@ CONFIGS = {
     "data-pretrain.yaml": ("data.build", "DataConfig"),
     "demo.yaml": ("serve.demo", "DemoConfig"),
     "driving_score.yaml": ("evaluate.driving_score", "DrivingScoreConfig"),
+    "envelope.yaml": ("evaluate.envelope", "EnvelopeConfig"),
     "evaluate.yaml": ("evaluate.report", "EvaluateConfig"),
     "export.yaml": ("quantize.export", "ExportConfig"),
     "page.yaml": ("evaluate.page", "PageConfig"),
@@ -48,6 +50,7 @@ CONFIGS = {
     "tiny.yaml": ("train.tiny", "TinyConfig"),
     "train.yaml": ("train.sft", "TrainConfig"),
     "vehicle.yaml": ("ridetune.control.vehicle", "Vehicle"),
+    "verified.yaml": ("ridetune.envelope", "Envelope"),
 }
 
 

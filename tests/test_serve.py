@@ -107,6 +107,12 @@ def test_memories_are_taken(client: TestClient) -> None:
     assert ask(client, memories=json.dumps([MEMORY, flat])).status_code == 200
 
 
+def test_the_condition_of_the_road_is_taken_by_name_or_left_out(client: TestClient) -> None:
+    assert ask(client, condition="snow").status_code == 200
+    assert ask(client, condition="").status_code == 200
+    assert_one_sentence(ask(client, condition="hail"), 422, "one of sunny, rain, fog, snow, night")
+
+
 def test_ready_and_alive_are_reported(client: TestClient) -> None:
     assert client.get("/healthz").json() == {"alive": True}
     ready = client.get("/readyz")

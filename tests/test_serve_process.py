@@ -194,9 +194,9 @@ def test_frames_are_spread_over_sub_folders(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         for number in range(count):
             shutil.copy("configs/demo.yaml", tmp_path / name / f"{number}.jpg")
-    names = [Path(frame.name).parent.name for frame in folder_frames(tmp_path, 6)]
+    names = [Path(frame.name).parent.name for frame in folder_frames(tmp_path, 6, None)]
     assert {name: names.count(name) for name in names} == {"night": 3, "rain": 1, "sunny": 2}
-    assert len(folder_frames(tmp_path, 100)) == 14
+    assert len(folder_frames(tmp_path, 100, "fog")) == 14
     many = [[Path(f"{folder}/x.jpg")] for folder in range(10)]
     assert [str(path.parent) for path in pick_evenly(many, 2)] == ["2", "7"]
 

@@ -94,7 +94,8 @@ def drive_policy(
     """Drive a scenario with the matrices of a source, starting from the default.
 
     One question is open at a time; an answer that takes longer than `patience_s` is dropped, for
-    the scene that it was about is gone. The same answers give the same drive, bit by bit.
+    the scene that it was about is gone. The gate is told the condition, as by a car's own sensors.
+    The same answers give the same drive, bit by bit.
     """
     car = _Car(scenario, condition, vehicle, default, spread, seed)
     every, patience = _steps(ask_every_s), _steps(patience_s)
@@ -108,7 +109,7 @@ def drive_policy(
             pending = _ask(source, car.moment(), patience_s)
             due = now + (math.ceil(pending.latency_s / PERIOD_S) if pending else 0)
         if pending is not None and due <= now:
-            verdict = gate.judge(pending.proposal, car.matrix)
+            verdict = gate.judge(pending.proposal, car.matrix, condition)
             changes.append(Change(now * PERIOD_S, verdict.outcome, verdict.matrix))
             if verdict.outcome != "refused":
                 heard = now
