@@ -12,7 +12,7 @@ from ridetune.envelope import Envelope
 from ridetune.matrix import STYLES, Style, ki_limit
 from ridetune.sample import CONDITIONS, Condition
 
-_PANEL, _GAP, _LEFT, _TOP = 220, 62, 62, 74
+_PANEL, _GAP, _LEFT, _TOP = 220, 78, 66, 74
 _COLOURS: dict[Style, str] = {
     "conservative": "#2a7f9e",
     "moderate": "#8a6d1f",
@@ -59,7 +59,7 @@ class _Panel:
             _, y = self.at(0.0, self._codec.share(value, self._y))
             self._text(self.left - 6, y + 4, f"{value:g}", "end")
         self._text(self.left + _PANEL / 2, self.top + _PANEL + 30, x_name, "middle")
-        x, y = self.left - 46, self.top + _PANEL / 2
+        x, y = self.left - 50, self.top + _PANEL / 2
         self.parts.append(
             f'<text x="{x}" y="{y}" transform="rotate(-90 {x} {y})" text-anchor="middle">'
             f"{escape(y_name)}</text>"
