@@ -18,9 +18,7 @@ REPORT = $(addprefix evaluate/,__main__.py report.py alignment.py decisions.py)
 PAGE = $(wildcard evaluate/page_parts/*) $(addprefix evaluate/,page.py animation.py curves.py \
 	plots.py sections.py style_drives.py tables.py)
 SWEEP = $(addprefix evaluate/,sweep.py sweep_runs.py workers.py)
-ENVELOPE = $(addprefix evaluate/,envelope.py envelope_plot.py gate_proof.py monte_carlo.py \
-	peeling.py stability.py switching.py)
-LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP) $(ENVELOPE),$(wildcard evaluate/*.py))
+LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP),$(wildcard evaluate/*.py))
 SIMULATION = $(wildcard ridetune/control/*.py ridetune/sim/*.py) configs/ranges.yaml \
 	configs/vehicle.yaml
 CONTRACT = $(addprefix ridetune/,alignment.py codec.py config.py matrix.py sample.py stage.py)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluate.gate_proof import summarise
-from evaluate.monte_carlo import MonteCarlo, Search, draw_car, project
-from evaluate.peeling import peel
-from evaluate.stability import certifies, common_lyapunov, modes, speed_loop, steering_loop
-from evaluate.switching import corners, shortest_stay, worst_modes
+from evaluate.envelope.monte_carlo import MonteCarlo, Search, draw_car, project
+from evaluate.envelope.peeling import peel
+from evaluate.envelope.proof import summarise
+from evaluate.envelope.stability import certifies, common_lyapunov, modes, speed_loop, steering_loop
+from evaluate.envelope.switching import corners, shortest_stay, worst_modes
 from ridetune.control.tracker import PERIOD_S
 from ridetune.control.vehicle import Sensors
 from ridetune.envelope import Envelope, Limits, clamp, hash_of

@@ -40,7 +40,7 @@ CONFIGS = {
     "data-pretrain.yaml": ("data.build", "DataConfig"),
     "demo.yaml": ("serve.demo", "DemoConfig"),
     "driving_score.yaml": ("evaluate.driving_score", "DrivingScoreConfig"),
-    "envelope.yaml": ("evaluate.envelope", "EnvelopeConfig"),
+    "envelope.yaml": ("evaluate.envelope.build", "EnvelopeConfig"),
     "evaluate.yaml": ("evaluate.report", "EvaluateConfig"),
     "export.yaml": ("quantize.export", "ExportConfig"),
     "page.yaml": ("evaluate.page", "PageConfig"),

@@ -2,7 +2,7 @@
 
 proposals -> gate (envelope, check) -> what came out driven on many other cars, with other noise
 
-    python -m evaluate.gate_proof --config configs/envelope.yaml
+    python -m evaluate.envelope.proof --config configs/envelope.yaml
 
 With `proof.box=false` the boxes are as wide as the ranges and the check stands alone.
 Both the proposal and what the gate made of it are driven.
@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from evaluate.significance import clopper_pearson
 from ridetune.control.vehicle import Vehicle
 from ridetune.envelope import Envelope
 from ridetune.gate import SafetyGate, Verdict
@@ -35,9 +36,8 @@ from ridetune.sim.rollout import rollout
 from ridetune.sim.scenarios import LANE_CHANGE, LEFT_TURN, SCENARIOS, Scenario
 from ridetune.stage import run_stage
 
-from .envelope import EnvelopeConfig
+from .build import EnvelopeConfig
 from .monte_carlo import MonteCarlo, draw_car, project
-from .significance import clopper_pearson
 
 _log = logging.getLogger(__name__)
 KINDS = ("uniform", "log_uniform", "corner", "climbed", "ki_rule", "step")

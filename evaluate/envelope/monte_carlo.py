@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from evaluate.significance import clopper_pearson
 from ridetune.codec import MatrixCodec
 from ridetune.control.vehicle import Vehicle
 from ridetune.envelope import Box, Evidence, Limits, clamp
@@ -30,8 +31,6 @@ from ridetune.sim.check import (
 )
 from ridetune.sim.plant import Spread, draw_spread
 from ridetune.sim.scenarios import Scenario
-
-from .significance import clopper_pearson
 
 Shares = NDArray[np.float64]  # [matrix, parameter], place within the ranges on the codec's scale
 

@@ -11,7 +11,6 @@ its corners passed by the gate's check, verified on independent matrices, cars a
 import json
 import logging
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,11 +24,10 @@ from ridetune.matrix import PARAMETERS, STYLES, Ranges
 from ridetune.sample import CONDITIONS, Condition
 from ridetune.sim.check import OPEN_ROAD, RolloutCheck
 from ridetune.sim.scenarios import LANE_CHANGE, LEFT_TURN, SCENARIOS, Scenario
-from ridetune.stage import run_stage
 
-from .envelope_plot import plot_envelope
 from .monte_carlo import MonteCarlo, Search, Shares, project
 from .peeling import peel
+from .plot import plot_envelope
 from .switching import badly_damped, speed_corners, steering_corners, study_loops
 
 _log = logging.getLogger(__name__)
@@ -41,7 +39,7 @@ _CREEP = 0.06  # share of the way to the default
 
 @dataclass(frozen=True)
 class ProofConfig:
-    """Sizes of the proof of the gate; see `evaluate/gate_proof.py`."""
+    """Sizes of the proof of the gate; see `evaluate/envelope/proof.py`."""
 
     proposals: int
     first: int
@@ -203,7 +201,3 @@ def _shares_broken(search: Search) -> dict[str, float]:
         "turn": round(float(search.turn.mean()), 4),
         "road": round(float(search.road.mean()), 4),
     }
-
-
-if __name__ == "__main__":
-    sys.exit(run_stage(EnvelopeConfig, "configs/envelope.yaml", build, __doc__))

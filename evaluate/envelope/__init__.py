@@ -1,0 +1,1 @@
+"""The verified envelope of the gate, and the proof of the gate on it. Simulation."""
