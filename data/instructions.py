@@ -2,7 +2,8 @@
 
 In: data/bank/*.yaml, written out by hand: sentences, templates with slots, a phrase grammar,
 feedback phrases and reasons. Out: drawn instructions. Whole sentences and whole templates are held
-out for testing; a held-out sentence that nearly repeats a training sentence goes to training.
+out for testing; a held-out sentence that nearly repeats a training sentence goes to training, and
+so does held-out feedback.
 """
 
 import hashlib
@@ -127,11 +128,15 @@ class Bank:
 
     @cached_property
     def _feedback(self) -> dict[tuple[FeedbackKind, bool], list[str]]:
-        return {
-            (kind, held_out): [t for t in texts if (_share(t) < HELD_OUT_FEEDBACK) == held_out]
-            for kind, texts in self.feedback.items()
-            for held_out in (False, True)
+        said = [(kind, text) for kind, texts in self.feedback.items() for text in texts]
+        texts = [text for _, text in said]
+        apart = _keep_apart(texts, [_share(text) < HELD_OUT_FEEDBACK for text in texts])
+        found: dict[tuple[FeedbackKind, bool], list[str]] = {
+            (kind, held_out): [] for kind in self.feedback for held_out in (False, True)
         }
+        for (kind, text), held_out in zip(said, apart, strict=True):
+            found[kind, bool(held_out)].append(text)
+        return found
 
     def feedback_of(self, kind: FeedbackKind, split: Split) -> list[str]:
         """Feedback sentences of one kind that a split may use."""
@@ -150,7 +155,7 @@ def load_bank(folder: Path = BANK) -> Bank:
     if not phrases:
         raise ValueError(f"no sentences in {folder}; expected files such as moderate_families.yaml")
     return Bank(
-        phrases=_keep_apart(phrases.values()),
+        phrases=_apart(phrases.values()),
         slots=slots,
         grammar=grammar,
         feedback=_read(folder / "feedback.yaml"),
@@ -199,30 +204,41 @@ def _phrases_of(path: Path, slots: dict[str, list[str]]) -> Iterable[Phrase]:
             yield Phrase(text, style, level, template["intent"], name, held_out)
 
 
-def _keep_apart(phrases: Iterable[Phrase]) -> tuple[Phrase, ...]:
-    """Move held-out phrases that nearly repeat a training phrase over to training."""
+def _apart(phrases: Iterable[Phrase]) -> tuple[Phrase, ...]:
+    """Phrases in the order of their names, as held out as `_keep_apart` leaves them."""
     kept = sorted(phrases, key=lambda p: p.phrase_id)
-    words = _word_matrix([p.text for p in kept])  # [phrase, word] of 0 and 1
-    sizes = words.sum(axis=1)
-    held_out = np.array([p.held_out for p in kept])
-    moved = ~held_out  # what the remaining held-out phrases are still to be compared with
-    while moved.any() and held_out.any():
-        shared = words[held_out] @ words[moved].T  # [held out, training]
-        either = sizes[held_out][:, None] + sizes[moved][None, :] - shared
-        repeats = np.zeros(len(kept), bool)
-        repeats[held_out] = (shared >= NEAR_REPEAT * either).any(axis=1)
-        held_out &= ~repeats
-        moved = repeats
+    held_out = _keep_apart([p.text for p in kept], [p.held_out for p in kept])
     return tuple(replace(p, held_out=bool(h)) for p, h in zip(kept, held_out, strict=True))
 
 
-def _word_matrix(texts: list[str]) -> NDArray[np.float32]:
+def _keep_apart(texts: list[str], asked: list[bool]) -> NDArray[np.bool_]:
+    """Which texts are held out: those asked for that do not nearly repeat a training text."""
+    held_out = np.array(asked)
+    near = _near_repeats(texts, np.flatnonzero(held_out))
+    moved = ~held_out  # what the remaining held-out texts are still to be compared with
+    while moved.any() and held_out.any():
+        repeats = np.zeros(len(texts), bool)
+        repeats[[i for i in near if held_out[i] and moved[near[i]].any()]] = True
+        held_out &= ~repeats
+        moved = repeats
+    return held_out
+
+
+def _near_repeats(texts: list[str], of: NDArray[np.intp]) -> dict[int, NDArray[np.intp]]:
+    """For each text number in `of`, the numbers of all texts that say nearly the same words."""
     words = [set(_normal(text).split()) for text in texts]
-    column = {word: i for i, word in enumerate(sorted(set().union(*words)))}
-    matrix = np.zeros((len(texts), len(column)), np.float32)
-    for row, own in enumerate(words):
-        matrix[row, [column[word] for word in own]] = 1
-    return matrix
+    sizes = np.array([len(own) for own in words])
+    lists: dict[str, list[int]] = {}
+    for number, own in enumerate(words):
+        for word in own:
+            lists.setdefault(word, []).append(number)
+    texts_with = {word: np.array(numbers) for word, numbers in lists.items()}
+    near = {}
+    for i in of.tolist():
+        found = [texts_with[word] for word in words[i]]
+        shared = np.bincount(np.concatenate(found), minlength=len(texts)) if found else 0 * sizes
+        near[i] = np.flatnonzero(shared >= NEAR_REPEAT * (sizes[i] + sizes - shared))
+    return near
 
 
 def _check_grammar(grammar: dict[str, list[str]]) -> None:

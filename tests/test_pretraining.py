@@ -156,6 +156,19 @@ def test_pretraining_writes_a_folder_that_the_other_stages_read(
     assert [path.name for path in tmp_path.iterdir()] == ["tiny", "tiny-stages"]
 
 
+def test_a_run_goes_on_from_an_earlier_base_with_its_words_and_without_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, teacher: Teacher
+) -> None:
+    monkeypatch.setattr(Teacher, "load", staticmethod(lambda: teacher))
+    monkeypatch.setattr(train.tiny, "learn_pictures", lambda *_: pytest.fail("seen already"))
+    config = replace(tiny_config(tmp_path / "tiny"), start=small_base())
+    still = replace(config.both, learning_rate=0.0)
+    pretrain(replace(config, words=replace(config.words, learning_rate=0.0), both=still))
+    after = load_model(config.out).state_dict()
+    for name, weight in load_model(small_base()).state_dict().items():
+        torch.testing.assert_close(after[name], weight.half().float())
+
+
 def kind_of() -> dict[str, int]:
     return read_feedback(small_data() / "feedback-train.json")
 

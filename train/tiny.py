@@ -9,8 +9,9 @@ Hugging Face tools read it, in fp16. Trained once and committed as models/tiny.
 
     python -m train.tiny --config configs/tiny.yaml
 
-What a stage made is kept beside the model, so a run that was stopped goes on behind its last whole
-stage.
+With `start` a run goes on from an earlier base, on more sentences: its tokenizer, words and eyes
+are taken over, and stage two is left out. What a stage made is kept beside the model, so a run that
+was stopped goes on behind its last whole stage.
 """
 
 import hashlib
@@ -27,10 +28,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ridetune.config import save_config
-from ridetune.contract import Contract
+from ridetune.contract import Contract, load_tokenizer
 from ridetune.matrix import Ranges
 from ridetune.prompt import ACTION_TOKENS, PromptBuilder
-from ridetune.qwen import encode_frames
+from ridetune.qwen import encode_frames, load_model
 from ridetune.sample import Sample, read_samples
 from ridetune.scene import SCENE_QUESTIONS, scene_answers
 from ridetune.stage import Stopwatch, hash_file, new_folder, run_stage, write_manifest
@@ -52,8 +53,9 @@ EMBEDDING_SCALE = 0.04
 
 @dataclass(frozen=True)
 class TinyConfig:
-    """What to pretrain, on what, for how long."""
+    """What to pretrain, on what, for how long. start: an earlier base to go on from, or None."""
 
+    start: Path | None
     data: Path
     out: Path
     ranges: Path
@@ -84,11 +86,15 @@ def _pretrain(config: TinyConfig) -> None:
     phrases = read_phrases(config.data / "phrases.jsonl")
     held_out = read_phrases(config.data / "phrases-test.jsonl")
     teacher = Teacher.load()
-    tokenizer = build_tokenizer(teacher.word_pieces, _corpus(phrases), config.shape.vocabulary)
+    if config.start is None:
+        tokenizer = build_tokenizer(teacher.word_pieces, _corpus(phrases), config.shape.vocabulary)
+        model: Any = build_model(config.shape, tokenizer)
+    else:
+        tokenizer, model = load_tokenizer(config.start), load_model(config.start).train()
     prompts = contract.prompts(tokenizer)
-    model = build_model(config.shape, tokenizer)
     pieces, vectors = teacher.words_of(tokenizer, config.shape.hidden)
-    start_embeddings(model, prompts, pieces, vectors)
+    if config.start is None:
+        start_embeddings(model, prompts, pieces, vectors)
     model.to(torch.device(config.device))
 
     stages = Stages(config)
@@ -114,7 +120,8 @@ def _pretrain(config: TinyConfig) -> None:
         learn_pictures(model, contract, samples, pixels, config)
         return visual.state_dict()
 
-    visual.load_state_dict(stages.once("pictures", pictures))
+    if config.start is None:
+        visual.load_state_dict(stages.once("pictures", pictures))
     learn_both(model, contract, prompts, samples, pixels, task, held_out, config)
     if not is_first():
         return
@@ -138,6 +145,8 @@ class Stages:
     def __init__(self, config: TinyConfig) -> None:
         shaping = (config.seed, config.shape, config.words, config.pictures, config.word_dropout)
         about = hash_file(config.data / "manifest.json") + repr(shaping)
+        if config.start is not None:
+            about += hash_file(config.start / "model.safetensors")
         name = hashlib.sha256(about.encode()).hexdigest()[:12]
         self._folder = config.out.with_name(f"{config.out.name}-stages") / name
         self._folder.mkdir(parents=True, exist_ok=True)
