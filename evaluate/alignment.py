@@ -14,7 +14,7 @@ from ridetune.alignment import (
 )
 from ridetune.codec import NUM_BINS, MatrixCodec
 from ridetune.matrix import ControllerMatrix
-from ridetune.sample import ADVERSE, LEVELS, Memory, Sample
+from ridetune.sample import ADVERSE, Memory, Sample
 
 Pair = tuple[ControllerMatrix, ControllerMatrix]
 
@@ -33,16 +33,9 @@ def score(
     return {
         "command_alignment": round(float(np.mean(aligned)), 2),
         "style_accuracy": round(float(np.mean(right)), 4),
-        "style_accuracy_by_level": {
-            level: round(
-                float(
-                    np.mean([r for r, s in zip(right, samples, strict=True) if s.level == level])
-                ),
-                4,
-            )
-            for level in LEVELS
-            if any(s.level == level for s in samples)
-        },
+        "style_accuracy_by_level": _shares(right, [s.level for s in samples]),
+        "style_accuracy_by_voice": _shares(right, [voice_of(s.phrase_id) for s in samples]),
+        "command_alignment_by_voice": _shares(aligned, [voice_of(s.phrase_id) for s in samples]),
         "scenario_alignment": round(
             scenario_alignment([pair for c in ADVERSE for pair in pairs[c]], codec), 4
         ),
@@ -50,6 +43,19 @@ def score(
         "decisions": len(matrices),
         "pairs": sum(len(p) for p in pairs.values()),
     }
+
+
+def voice_of(phrase_id: str) -> str:
+    """Who wrote a phrase of the bank: `moderate_families/II/...` is of the voice `families`."""
+    return phrase_id.split("/")[0].split("_", 1)[-1]
+
+
+def _shares(values: Sequence[float], groups: Sequence[str]) -> dict[str, float]:
+    """The mean of the values in each group."""
+    members: dict[str, list[float]] = {}
+    for value, group in sorted(zip(values, groups, strict=True), key=lambda pair: pair[1]):
+        members.setdefault(group, []).append(value)
+    return {group: round(float(np.mean(own)), 4) for group, own in members.items()}
 
 
 def clear_adverse_pairs(

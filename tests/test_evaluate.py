@@ -289,3 +289,14 @@ def test_report_holds_every_score(
     assert result["memory"]["too_aggressive"]["decisions"] == 3
     assert sum(result["gate"].values()) == 30
     assert result["peak_rss_mb"] > 0
+
+
+def test_scores_by_voice_are_those_of_its_own_phrases(
+    samples: list[Sample], codec: MatrixCodec
+) -> None:
+    named = [replace(s, phrase_id="moderate_voices/II/1") for s in samples[:3]]
+    named.append(replace(samples[3], phrase_id="conservative_mirrors/I/2"))
+    wrong = middle("aggressive" if named[3].style != "aggressive" else "moderate", codec.ranges)
+    scores = score([*(s.matrix for s in named[:3]), wrong], named, codec)
+    assert scores["style_accuracy_by_voice"] == {"mirrors": 0.0, "voices": 1.0}
+    assert scores["command_alignment_by_voice"]["voices"] > 99

@@ -127,7 +127,10 @@ def _pretrain(config: TinyConfig) -> None:
         return
 
     with new_folder(config.out) as folder:
-        model.half().save_pretrained(folder)
+        model.half()
+        for part in (model.config, model.config.text_config, model.config.vision_config):
+            part.dtype = torch.float16
+        model.save_pretrained(folder)
         save_tokenizer(tokenizer, contract.vision, folder)
         contract.save(folder)
         save_config(config, folder / "pretraining.yaml")
