@@ -8,7 +8,6 @@ so does held-out feedback.
 
 import hashlib
 import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -103,28 +102,11 @@ class Bank:
 
     def repeats_held_out(self, text: str) -> bool:
         """Whether a text says nearly the same words as a held-out phrase."""
-        words = set(_normal(text).split())
-        shared = Counter(at for word in words for at in self._held_out_with.get(word, ()))
-        return any(
-            count >= NEAR_REPEAT * (len(words) + self._held_out_sizes[at] - count)
-            for at, count in shared.items()
-        )
+        return bool(self._held_out_words.repeats(text).any())
 
     @cached_property
-    def _held_out_words(self) -> list[set[str]]:
-        return [set(_normal(p.text).split()) for p in self.phrases if p.held_out]
-
-    @cached_property
-    def _held_out_sizes(self) -> list[int]:
-        return [len(words) for words in self._held_out_words]
-
-    @cached_property
-    def _held_out_with(self) -> dict[str, list[int]]:
-        numbers: dict[str, list[int]] = {}
-        for at, words in enumerate(self._held_out_words):
-            for word in words:
-                numbers.setdefault(word, []).append(at)
-        return numbers
+    def _held_out_words(self) -> "_WordIndex":
+        return _WordIndex([p.text for p in self.phrases if p.held_out])
 
     @cached_property
     def _feedback(self) -> dict[tuple[FeedbackKind, bool], list[str]]:
@@ -214,7 +196,8 @@ def _apart(phrases: Iterable[Phrase]) -> tuple[Phrase, ...]:
 def _keep_apart(texts: list[str], asked: list[bool]) -> NDArray[np.bool_]:
     """Which texts are held out: those asked for that do not nearly repeat a training text."""
     held_out = np.array(asked)
-    near = _near_repeats(texts, np.flatnonzero(held_out))
+    index = _WordIndex(texts)
+    near = {i: np.flatnonzero(index.repeats(texts[i])) for i in np.flatnonzero(held_out).tolist()}
     moved = ~held_out  # what the remaining held-out texts are still to be compared with
     while moved.any() and held_out.any():
         repeats = np.zeros(len(texts), bool)
@@ -224,21 +207,26 @@ def _keep_apart(texts: list[str], asked: list[bool]) -> NDArray[np.bool_]:
     return held_out
 
 
-def _near_repeats(texts: list[str], of: NDArray[np.intp]) -> dict[int, NDArray[np.intp]]:
-    """For each text number in `of`, the numbers of all texts that say nearly the same words."""
-    words = [set(_normal(text).split()) for text in texts]
-    sizes = np.array([len(own) for own in words])
-    lists: dict[str, list[int]] = {}
-    for number, own in enumerate(words):
-        for word in own:
-            lists.setdefault(word, []).append(number)
-    texts_with = {word: np.array(numbers) for word, numbers in lists.items()}
-    near = {}
-    for i in of.tolist():
-        found = [texts_with[word] for word in words[i]]
-        shared = np.bincount(np.concatenate(found), minlength=len(texts)) if found else 0 * sizes
-        near[i] = np.flatnonzero(shared >= NEAR_REPEAT * (sizes[i] + sizes - shared))
-    return near
+class _WordIndex:
+    """Finds which of many texts say nearly the same words as another one."""
+
+    def __init__(self, texts: list[str]) -> None:
+        words = [set(_normal(text).split()) for text in texts]
+        self._sizes = np.array([len(own) for own in words], int)
+        lists: dict[str, list[int]] = {}
+        for number, own in enumerate(words):
+            for word in own:
+                lists.setdefault(word, []).append(number)
+        self._texts_with = {word: np.array(numbers) for word, numbers in lists.items()}
+
+    def repeats(self, text: str) -> NDArray[np.bool_]:
+        """For each of the texts, whether it nearly repeats this one."""
+        words = set(_normal(text).split())
+        shared = np.zeros(len(self._sizes), int)
+        for word in words & self._texts_with.keys():
+            shared[self._texts_with[word]] += 1
+        either = len(words) + self._sizes - shared
+        return np.asarray((shared > 0) & (shared >= NEAR_REPEAT * either))
 
 
 def _check_grammar(grammar: dict[str, list[str]]) -> None:

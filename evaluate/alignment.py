@@ -28,14 +28,15 @@ def score(
         command_alignment(m, s.style, ranges) for m, s in zip(matrices, samples, strict=True)
     ]
     right = [style_of(m, ranges) == s.style for m, s in zip(matrices, samples, strict=True)]
+    voices = [voice_of(s.phrase_id) for s in samples]
     pairs = clear_adverse_pairs(matrices, samples)
     by_condition = {c: scenario_alignment(pairs[c], codec) for c in ADVERSE if pairs[c]}
     return {
         "command_alignment": round(float(np.mean(aligned)), 2),
         "style_accuracy": round(float(np.mean(right)), 4),
-        "style_accuracy_by_level": _shares(right, [s.level for s in samples]),
-        "style_accuracy_by_voice": _shares(right, [voice_of(s.phrase_id) for s in samples]),
-        "command_alignment_by_voice": _shares(aligned, [voice_of(s.phrase_id) for s in samples]),
+        "style_accuracy_by_level": _means(right, [s.level for s in samples]),
+        "style_accuracy_by_voice": _means(right, voices),
+        "command_alignment_by_voice": _means(aligned, voices),
         "scenario_alignment": round(
             scenario_alignment([pair for c in ADVERSE for pair in pairs[c]], codec), 4
         ),
@@ -50,7 +51,7 @@ def voice_of(phrase_id: str) -> str:
     return phrase_id.split("/")[0].split("_", 1)[-1]
 
 
-def _shares(values: Sequence[float], groups: Sequence[str]) -> dict[str, float]:
+def _means(values: Sequence[float], groups: Sequence[str]) -> dict[str, float]:
     """The mean of the values in each group."""
     members: dict[str, list[float]] = {}
     for value, group in sorted(zip(values, groups, strict=True), key=lambda pair: pair[1]):

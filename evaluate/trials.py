@@ -154,7 +154,7 @@ def drive_served(policy: Policy, trial: Trial, condition: Condition, car: Car) -
     """One drive with the bundle in the loop, the six bins decided in one pass."""
 
     def propose(frame: bytes, kept: ControllerMatrix) -> ControllerMatrix:
-        return policy.decide(frame, trial.instruction, last_safe=kept, condition=condition).proposal
+        return policy.decide(frame, trial.instruction, last_safe=kept).proposal
 
     return _drive_asked(propose, car.asking.latency_s, trial, condition, car)
 

@@ -10,11 +10,9 @@ from tokenizers import Tokenizer
 from ridetune.contract import Contract
 from ridetune.engines import Engine
 from ridetune.matrix import ControllerMatrix
-from ridetune.policy import read_text
+from ridetune.policy import MAX_MATRIX_TOKENS, read_text
 from ridetune.sample import Memory
 from ridetune.vision import read_patches
-
-MAX_MATRIX_TOKENS = 80
 
 
 class MatrixWriter:

@@ -29,7 +29,7 @@ from ridetune.contract import load_tokenizer
 from ridetune.control.vehicle import Vehicle
 from ridetune.matrix import ControllerMatrix
 from ridetune.ort_engine import OrtEngine
-from ridetune.policy import Policy
+from ridetune.policy import MAX_MATRIX_TOKENS, Policy
 from ridetune.sample import CONDITIONS, Sample, read_samples
 from ridetune.sim.check import load_gate
 from ridetune.stage import MANIFEST_FILE, run_stage
@@ -37,7 +37,6 @@ from ridetune.vision import read_patches
 
 from .served_memory import measure_served
 
-MAX_MATRIX_TOKENS = 80
 STAGES = ("image", "prefill", "prompt", "decide", "gate")
 
 

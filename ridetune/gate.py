@@ -68,10 +68,10 @@ class SafetyGate:
         self._bounds: Box = tuple(zip(ranges.lowest, ranges.highest, strict=True))
         contexts: tuple[Condition | None, ...] = (*CONDITIONS, None)
         self._boxes = {c: envelope.box(c) if envelope else self._bounds for c in contexts}
+        default = ranges.default.values
+        fault = self._fault(default)
         for context, box in self._boxes.items():
-            fault = self._fault(ranges.default.values)
-            fault = fault or _outside(ranges.default.values, box)
-            fault = fault or self._drive(ranges.default.values, context)
+            fault = fault or _outside(default, box) or self._drive(default, context)
             if fault is not None:
                 raise ValueError(f"the default matrix of {ranges.vehicle} is not safe: {fault}")
 

@@ -23,6 +23,7 @@ from ridetune.sample import Condition, Memory
 from ridetune.vision import read_patches
 
 MAX_EXPLANATION_TOKENS = 96
+MAX_MATRIX_TOKENS = 80  # of a matrix written as text
 
 _ANSWER = re.compile(r"\s*scene\s*:\s*(?P<scene>.*?)\s*(?:\.(?!\d)\s*(?P<explanation>.*))?", re.S)
 # What the decoder of a word-piece vocabulary leaves between the pieces of one word.

@@ -22,12 +22,11 @@ from ridetune.matrix import (
 )
 from ridetune.sample import Condition
 from ridetune.sim.check import (
+    HARD_TRIALS,
     OPEN_ROAD,
     SHORT_TURN,
     Trial,
     drive_trial,
-    hard_cars,
-    hard_trials,
 )
 from ridetune.sim.plant import Spread, draw_spread
 from ridetune.sim.scenarios import Scenario
@@ -92,13 +91,12 @@ class MonteCarlo:
         """
         boxes = [*(self.style_box(style) for style in STYLES), self.whole]
         matrices = [self.draw(rng, boxes[i % 4], corners=False) for i in range(count)]
-        trials = hard_trials(hard_cars())
         broken = np.zeros((2, count), bool)
         for i, matrix in enumerate(tqdm(matrices, desc=f"search {condition}", disable=None)):
             for row, scenario in enumerate((SHORT_TURN, OPEN_ROAD)):
                 broken[row, i] = any(
                     self.breaks(matrix, trial, condition)
-                    for trial in trials
+                    for trial in HARD_TRIALS
                     if trial.scenario is scenario
                 )
         return Search(self.shares(matrices), broken[0], broken[1])

@@ -74,6 +74,16 @@ class _Panel:
             f'height="{bottom - top:.1f}" {style}/>'
         )
 
+    def styles(self) -> None:
+        """Where each style scores 100, dashed."""
+        for style in STYLES:
+            core = self._codec.ranges.styles[style]
+            self.box(
+                (core[self._x].lower, core[self._x].upper),
+                (core[self._y].lower, core[self._y].upper),
+                f'fill="none" stroke="{_COLOURS[style]}" stroke-width="1.6" stroke-dasharray="4 3"',
+            )
+
     def _text(self, x: float, y: float, text: str, anchor: str) -> None:
         self.parts.append(
             f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
@@ -93,25 +103,13 @@ def plot_envelope(codec: MatrixCodec, envelope: Envelope, points: Points) -> str
                 if broken
                 else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.3" class="kept"/>'
             )
-        _boxes(panel, codec, envelope, condition, _WL, _WS)
+        panel.styles()
+        box = envelope.box(condition)
+        panel.box(box[_WL], box[_WS], 'class="verified"')
         panel.axes("W_l, lateral error", "W_s, steering input")
         panels.append(panel)
     panels.append(_gains(codec, envelope, len(CONDITIONS)))
     return _page(panels)
-
-
-def _boxes(
-    panel: _Panel, codec: MatrixCodec, envelope: Envelope, condition: Condition, x: int, y: int
-) -> None:
-    for style in STYLES:
-        core = codec.ranges.styles[style]
-        panel.box(
-            (core[x].lower, core[x].upper),
-            (core[y].lower, core[y].upper),
-            f'fill="none" stroke="{_COLOURS[style]}" stroke-width="1.6" stroke-dasharray="4 3"',
-        )
-    box = envelope.box(condition)
-    panel.box(box[x], box[y], 'class="verified"')
 
 
 def _gains(codec: MatrixCodec, envelope: Envelope, number: int) -> _Panel:
@@ -125,13 +123,7 @@ def _gains(codec: MatrixCodec, envelope: Envelope, number: int) -> _Panel:
     left, _ = panel.place(box[_KP][0], box[_KI][0])
     outline = f"M{left:.1f} {bottom:.1f}L" + "L".join(curve) + f"L{right:.1f} {bottom:.1f}Z"
     panel.parts.append(f'<path d="{outline}" class="verified"/>')
-    for style in STYLES:
-        core = codec.ranges.styles[style]
-        panel.box(
-            (core[_KP].lower, core[_KP].upper),
-            (core[_KI].lower, core[_KI].upper),
-            f'fill="none" stroke="{_COLOURS[style]}" stroke-width="1.6" stroke-dasharray="4 3"',
-        )
+    panel.styles()
     panel.axes("K_p, proportional gain", "K_i, integral gain")
     return panel
 

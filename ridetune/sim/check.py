@@ -72,29 +72,20 @@ def violation(run: Rollout, scenario: Scenario, condition: Condition, limits: Li
     return None
 
 
-def hard_cars(*, mass: float = 0.25, least_tyres: float = 0.65) -> tuple[Spread, ...]:
-    """The corners that decide: heavy on worn tyres, and light on good ones, least and most delay.
+# The corners that decide: heavy on worn tyres, and light on good ones, least and most delay.
+# The verified population ends at mass +-20 %, tyres 0.7 to 1.1, steering delay 0 to 0.15 s.
+_HEAVY = Spread(1.25, 0.65, 0.0, 0.15)
+_HEAVY_LATE = Spread(1.25, 0.65, 0.15, 0.15)
+_LIGHT = Spread(0.75, 1.1, 0.15, 0.15)
 
-    The verified population ends at mass +-20 %, tyres 0.7 to 1.1, steering delay 0 to 0.15 s.
-    """
-    heavy, light = 1.0 + mass, 1.0 - mass
-    return (
-        Spread(heavy, least_tyres, 0.0, 0.15),
-        Spread(heavy, least_tyres, 0.15, 0.15),
-        Spread(light, 1.1, 0.15, 0.15),
-    )
-
-
-def hard_trials(cars: Sequence[Spread]) -> tuple[Trial, ...]:
-    """What the check drives, soonest to fail first."""
-    heavy, heavy_late, light = cars
-    return (
-        Trial(SHORT_TURN, heavy),
-        Trial(SHORT_TURN, heavy_late, seed=1),
-        Trial(OPEN_ROAD, heavy_late),
-        Trial(OPEN_ROAD, light, seed=1),
-        Trial(SHORT_TURN, light, seed=2),
-    )
+# What the check drives, soonest to fail first.
+HARD_TRIALS = (
+    Trial(SHORT_TURN, _HEAVY),
+    Trial(SHORT_TURN, _HEAVY_LATE, seed=1),
+    Trial(OPEN_ROAD, _HEAVY_LATE),
+    Trial(OPEN_ROAD, _LIGHT, seed=1),
+    Trial(SHORT_TURN, _LIGHT, seed=2),
+)
 
 
 class RolloutCheck:
@@ -104,11 +95,11 @@ class RolloutCheck:
         self,
         vehicle: Vehicle,
         limits: Limits,
-        trials: Sequence[Trial] | None = None,
+        trials: Sequence[Trial] = HARD_TRIALS,
     ) -> None:
         self._vehicle = vehicle
         self._limits = limits
-        self._trials = hard_trials(hard_cars()) if trials is None else tuple(trials)
+        self._trials = tuple(trials)
         ordered = sorted(CONDITIONS, key=lambda c: EFFECTS[c].friction)
         self._slippery, self._firm = ordered[0], ordered[-1]
         self._known = lru_cache(maxsize=_ANSWERS_KEPT)(self._drive)
