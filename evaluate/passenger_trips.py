@@ -97,7 +97,7 @@ class ServedPolicy:
             default = self._policy.contract.ranges.default
             frame = self._frame(place, zlib.crc32(instruction.encode()) % self._streets)
             decision = self._policy.decide(frame, instruction, memories, last_safe=default)
-            self._known[question] = settle(self._gate, decision.proposal, default)
+            self._known[question] = settle(self._gate, decision.proposal, default, place.condition)
         return self._known[question]
 
     def recall_alike(self, count: int) -> Recall[Place]:
@@ -158,12 +158,18 @@ class IdealPolicy:
 
 
 def settle(
-    gate: SafetyGate, proposal: ControllerMatrix, default: ControllerMatrix
+    gate: SafetyGate,
+    proposal: ControllerMatrix,
+    default: ControllerMatrix,
+    condition: Condition,
 ) -> ControllerMatrix:
-    """Where the car is once the gate has let the same proposal through again and again."""
+    """Where the car is once the gate has let the same proposal through again and again.
+
+    The gate is told the condition, as in a drive.
+    """
     matrix = default
     for _ in range(_SLEW_STEPS):
-        matrix = gate.judge(proposal, matrix).matrix
+        matrix = gate.judge(proposal, matrix, condition).matrix
     return matrix
 
 

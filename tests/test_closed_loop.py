@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,7 @@ from ridetune.sample import (
     Observation,
     Sample,
 )
+from ridetune.sim.check import load_gate
 from ridetune.sim.passengers import WISHES, Priors, matrix_of_taste
 from ridetune.sim.scenarios import ACCELERATION, LANE_CHANGE
 from tests.fake_policy import CONTRACT, TOKENIZER, FakeEngine
@@ -288,8 +290,16 @@ def test_a_sentence_that_stands_for_two_styles_is_left_out() -> None:
 def test_the_gate_lets_a_far_matrix_through_step_by_step() -> None:
     far = ControllerMatrix(1.2, 0.0, 0.0, 1.5, 20.0, 6.0)
     assert GATE.judge(far, DEFAULT).matrix != far
-    assert settle(GATE, far, DEFAULT).values == pytest.approx(far.values)
-    assert settle(GATE, ControllerMatrix(9.0, 0, 0, 0.1, 1.0, 0.3), DEFAULT) == DEFAULT
+    assert settle(GATE, far, DEFAULT, "sunny").values == pytest.approx(far.values)
+    wild = ControllerMatrix(9.0, 0, 0, 0.1, 1.0, 0.3)
+    assert settle(GATE, wild, DEFAULT, "sunny") == DEFAULT
+
+
+def test_a_settled_matrix_lies_in_the_box_of_its_road() -> None:
+    gate = load_gate(CONTRACT, VEHICLE, Path("configs/verified.yaml"))
+    brisk = ControllerMatrix(0.6, 0.0, 0.0, 0.05, 5.0, 1.0)
+    settled = {c: settle(gate, brisk, DEFAULT, c).wl for c in ("sunny", "snow")}
+    assert settled["sunny"] < settled["snow"], settled
 
 
 def test_the_ideal_policy_follows_words_weather_and_complaints() -> None:
