@@ -3,7 +3,8 @@
 In: data/bank/*.yaml, written out by hand: sentences, templates with slots, a phrase grammar,
 feedback phrases and reasons. Out: drawn instructions. Whole sentences and whole templates are held
 out for testing; a held-out sentence that nearly repeats a training sentence goes to training, and
-so does held-out feedback.
+so does held-out feedback. A file that says `trains_only: true` came after the test split closed:
+none of it is held out, and what nearly repeats a held-out sentence is left out.
 """
 
 import hashlib
@@ -131,13 +132,17 @@ def load_bank(folder: Path = BANK) -> Bank:
     grammar: dict[str, list[str]] = _read(folder / "grammar.yaml")
     _check_grammar(grammar)
     phrases: dict[str, Phrase] = {}
+    late: dict[str, Phrase] = {}
     for path in sorted(folder.glob("*_*.yaml")):
-        for phrase in _phrases_of(path, slots):
-            phrases.setdefault(_normal(phrase.text), phrase)
+        raw = _read(path)
+        into = late if raw.get("trains_only", False) else phrases
+        for phrase in _phrases_of(path, raw, slots):
+            into.setdefault(_normal(phrase.text), phrase)
     if not phrases:
         raise ValueError(f"no sentences in {folder}; expected files such as moderate_families.yaml")
+    more = [phrase for said, phrase in sorted(late.items()) if said not in phrases]
     return Bank(
-        phrases=_apart(phrases.values()),
+        phrases=_add_late(_apart(phrases.values()), more),
         slots=slots,
         grammar=grammar,
         feedback=_read(folder / "feedback.yaml"),
@@ -163,15 +168,15 @@ def vary(text: str, rng: np.random.Generator) -> str:
     return text
 
 
-def _phrases_of(path: Path, slots: dict[str, list[str]]) -> Iterable[Phrase]:
-    raw = _read(path)
+def _phrases_of(path: Path, raw: dict[str, Any], slots: dict[str, list[str]]) -> Iterable[Phrase]:
+    late = raw.get("trains_only", False)
     style = raw["style"]
     if style not in STYLES:
         raise ValueError(f"{path}: style {style!r} is none of {', '.join(STYLES)}")
     for level in LEVELS:
         for intent, texts in raw["sentences"][level].items():
             for text in texts:
-                held_out = _share(text) < HELD_OUT_SENTENCES
+                held_out = not late and _share(text) < HELD_OUT_SENTENCES
                 name = f"{path.stem}/{level}/{_digest(text)[:8]}"
                 yield Phrase(text, style, level, intent, name, held_out)
         for template in raw["templates"][level]:
@@ -181,7 +186,7 @@ def _phrases_of(path: Path, slots: dict[str, list[str]]) -> Iterable[Phrase]:
                 raise ValueError(
                     f"{path}: {text!r} uses the slot {unknown.pop()!r}, see slots.yaml"
                 )
-            held_out = _share(text) < HELD_OUT_TEMPLATES
+            held_out = not late and _share(text) < HELD_OUT_TEMPLATES
             name = f"{path.stem}/{level}/template-{_digest(text)[:8]}"
             yield Phrase(text, style, level, template["intent"], name, held_out)
 
@@ -191,6 +196,12 @@ def _apart(phrases: Iterable[Phrase]) -> tuple[Phrase, ...]:
     kept = sorted(phrases, key=lambda p: p.phrase_id)
     held_out = _keep_apart([p.text for p in kept], [p.held_out for p in kept])
     return tuple(replace(p, held_out=bool(h)) for p, h in zip(kept, held_out, strict=True))
+
+
+def _add_late(phrases: tuple[Phrase, ...], late: Iterable[Phrase]) -> tuple[Phrase, ...]:
+    """The phrases with all late ones that repeat none of the held-out."""
+    held_out = _WordIndex([p.text for p in phrases if p.held_out])
+    return (*phrases, *(p for p in late if not held_out.repeats(p.text).any()))
 
 
 def _keep_apart(texts: list[str], asked: list[bool]) -> NDArray[np.bool_]:
