@@ -11,7 +11,7 @@ import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -126,8 +126,9 @@ class Bank:
         return self._feedback[kind, split == "test"]
 
 
+@lru_cache(maxsize=1)
 def load_bank(folder: Path = BANK) -> Bank:
-    """Read and check the whole bank; ValueError names the file and the wrong entry."""
+    """Read and check the whole bank, once; ValueError names the file and the wrong entry."""
     slots: dict[str, list[str]] = _read(folder / "slots.yaml")
     grammar: dict[str, list[str]] = _read(folder / "grammar.yaml")
     _check_grammar(grammar)

@@ -25,9 +25,10 @@ Split = Literal["train", "calibration", "test"]
 
 @dataclass(frozen=True)
 class Observation:
-    """One camera frame as encoded JPEG or PNG bytes."""
+    """One camera frame as encoded JPEG or PNG bytes, and the car's own speed where known [m/s]."""
 
     frame: bytes
+    speed_mps: float | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ class Sample:
         """The row of the dataset file; `Sample.of_row` is its inverse."""
         return {
             "image": {"bytes": self.observation.frame, "path": None},
+            "speed_mps": self.observation.speed_mps,
             "instruction": self.instruction,
             "memories": [
                 {
@@ -100,7 +102,7 @@ class Sample:
         )
         kept = {name: row[name] for name in _PLAIN_FIELDS}
         return Sample(
-            observation=Observation(frame),
+            observation=Observation(frame, row.get("speed_mps")),
             memories=memories,
             matrix=ControllerMatrix.of(row["matrix"]),
             **kept,
@@ -132,6 +134,7 @@ def dataset_features() -> Any:
     return Features(
         {
             "image": Image(decode=False),
+            "speed_mps": Value("float32"),
             "memories": [memory],
             "matrix": matrix,
             **dict.fromkeys(_PLAIN_FIELDS, text),

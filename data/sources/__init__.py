@@ -1,0 +1,1 @@
+"""Where frames come from: nuScenes, a folder of images, videos, drive logs."""
