@@ -1,8 +1,8 @@
 """The label of a sample: a matrix inside the style's range, shifted by what adds risk or taste.
 
 position 0 is the conservative end of the style's [lower, upper], 1 the aggressive end. A clear
-scene draws near 0.65; rain, fog, snow and night shift towards 0; remembered feedback shifts
-against the complaint. The label always keeps K_i <= K_p^2 / 8.
+scene draws near 0.65; rain, fog, snow and night shift towards 0, and so does what else asks for
+care; remembered feedback shifts against the complaint. The label always keeps K_i <= K_p^2 / 8.
 """
 
 import numpy as np
@@ -11,6 +11,8 @@ from ridetune.alignment import CONSERVATIVE_SIGN
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import ControllerMatrix, Style, ki_limit
 from ridetune.sample import Condition, FeedbackKind
+
+from .sources.seen import Facts
 
 CLEAR_POSITION = 0.65
 CONDITION_SHIFT: dict[Condition, float] = {
@@ -25,6 +27,10 @@ FEEDBACK_SHIFT: dict[FeedbackKind, float] = {
     "just_right": 0.0,
     "too_conservative": +0.30,
 }
+# Where it is known: darkness beside another condition, glare, dense traffic, a lead car close by,
+# speed.
+DARK_SHIFT, GLARE_SHIFT, DENSE_SHIFT, CLOSE_SHIFT, FAST_SHIFT = -0.10, -0.10, -0.08, -0.05, -0.10
+FAST_MPS = 25.0
 COMMON_SPREAD = 0.06  # one draw for all parameters: people differ
 OWN_SPREAD = 0.05  # one draw for each parameter
 # W_h carries no style: drawn around this share of its lower..upper.
@@ -55,9 +61,14 @@ def draw_matrix(
     feedback: FeedbackKind | None,
     codec: MatrixCodec,
     rng: np.random.Generator,
+    *,
+    care: float = 0.0,
 ) -> ControllerMatrix:
-    """A labelled matrix inside [lower, upper] of the style."""
-    position = CLEAR_POSITION + CONDITION_SHIFT[condition] + rng.normal(0, COMMON_SPREAD)
+    """A labelled matrix inside [lower, upper] of the style.
+
+    care: a further shift of the position, as `shift_for_care` has it.
+    """
+    position = CLEAR_POSITION + CONDITION_SHIFT[condition] + rng.normal(0, COMMON_SPREAD) + care
     if feedback is not None:
         position += FEEDBACK_SHIFT[feedback]
     values = []
@@ -72,6 +83,22 @@ def draw_matrix(
         values.append(codec.value(low + place * (high - low), i))
     values[1] = min(values[1], ki_limit(values[0]))
     return ControllerMatrix.of(values)
+
+
+def shift_for_care(facts: Facts, speed_mps: float | None) -> float:
+    """What a scene asks for beyond its condition: a shift of the position, never above 0."""
+    shift = 0.0
+    if facts.dark and facts.condition != "night":
+        shift += DARK_SHIFT
+    if facts.low_sun:
+        shift += GLARE_SHIFT
+    if facts.traffic == "dense":
+        shift += DENSE_SHIFT
+    if facts.lead == "near":
+        shift += CLOSE_SHIFT
+    if speed_mps is not None and speed_mps > FAST_MPS:
+        shift += FAST_SHIFT
+    return shift
 
 
 def explain(style: Style, reason: str, condition: Condition, feedback: FeedbackKind | None) -> str:

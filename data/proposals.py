@@ -1,0 +1,79 @@
+"""A proposed pair and where it comes from, as the reviewers and the build read it.
+
+    frame + facts + instruction -> Proposal -> (review) -> Sample of the dataset
+
+A folder of proposals holds parts (part-00000.parquet, ...), each written whole or not at all.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ridetune.sample import Sample, dataset_features
+
+_OWN = ("proposal_id", "source", "licence", "frame_name", "annotator", "confidence")
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One pair that a person may look at before it is learned from.
+
+    frame_name: of the picture within its source, with its variant behind a `+`. annotator: who
+    proposed the label, with the version. confidence: 0..1, how much of what it went by was known.
+    """
+
+    sample: Sample
+    source: str
+    licence: str
+    frame_name: str
+    annotator: str
+    confidence: float
+
+    @property
+    def proposal_id(self) -> str:
+        """The same for the same frame, words and annotator, in every run."""
+        said = (self.source, self.frame_name, self.sample.instruction, self.annotator)
+        return hashlib.blake2b("\0".join(said).encode(), digest_size=8).hexdigest()
+
+    def as_row(self) -> dict[str, Any]:
+        """The row of a part; `Proposal.of_row` is its inverse."""
+        return {**self.sample.as_row(), **{name: getattr(self, name) for name in _OWN}}
+
+    @staticmethod
+    def of_row(row: dict[str, Any]) -> "Proposal":
+        """Read a row with its image undecoded."""
+        own = {name: row[name] for name in _OWN if name != "proposal_id"}
+        return Proposal(sample=Sample.of_row(row), **own)
+
+
+def write_part(proposals: Iterable[Proposal], path: Path) -> None:
+    """Write one part; it appears whole or not at all."""
+    from datasets import Dataset, Features, Value, disable_progress_bars
+
+    disable_progress_bars()  # a part takes a moment; the run has a bar of its own
+    own = {name: Value("float32" if name == "confidence" else "string") for name in _OWN}
+    features = Features({**dataset_features(), **own})
+    partial = path.with_suffix(".partial")
+    Dataset.from_list([p.as_row() for p in proposals], features=features).to_parquet(partial)
+    partial.rename(path)
+
+
+def read_proposals(folder: Path) -> Iterator[Proposal]:
+    """All proposals of a folder, one part in memory at a time.
+
+    ValueError where there are none or a part is damaged.
+    """
+    import pyarrow.parquet as parquet
+    from pyarrow import ArrowInvalid
+
+    paths = sorted(folder.glob("part-*.parquet"))
+    if not paths:
+        raise ValueError(f"{folder} holds no proposals; run `python -m data.propose` first")
+    for path in paths:
+        try:
+            rows = parquet.read_table(path).to_pylist()
+        except (OSError, ArrowInvalid) as error:
+            raise ValueError(f"{path} is damaged ({error}); propose again") from error
+        yield from map(Proposal.of_row, rows)
