@@ -1,0 +1,59 @@
+"""What an answer makes of a proposal: the model's words, and a matrix drawn by the rules."""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from ridetune.codec import MatrixCodec
+from ridetune.gate import SafetyGate
+from ridetune.matrix import Ranges
+from ridetune.scene import scene_answers
+
+from ..annotate import draw_matrix, shift_for_care
+from ..proposals import Proposal
+from ..sources.seen import Facts
+from .answers import Answer
+
+
+class Labeller:
+    """Puts a model's answer in the place of the rules' words, with a matrix that fits it."""
+
+    def __init__(self, ranges: Ranges, *, annotator: str, seed: int) -> None:
+        self._codec = MatrixCodec(ranges)
+        self._gate = SafetyGate(ranges, self._codec)
+        self._annotator = annotator
+        self._seed = seed
+
+    def label(self, proposal: Proposal, answer: Answer) -> Proposal:
+        """The proposal as the model has it; the same for the same proposal, answer and seed."""
+        facts = facts_of(answer)
+        care = shift_for_care(facts, proposal.sample.observation.speed_mps)
+        rng = np.random.default_rng([self._seed, int(proposal.proposal_id, 16)])
+        matrix = draw_matrix(answer.style, answer.condition, None, self._codec, rng, care=care)
+        verdict = self._gate.judge(matrix, matrix)
+        assert verdict.outcome == "accepted", verdict.reasons
+        sample = replace(
+            proposal.sample,
+            scene=answer.scene,
+            condition=answer.condition,
+            style=answer.style,
+            explanation=answer.explanation,
+            matrix=matrix,
+        )
+        return replace(
+            proposal, sample=sample, annotator=self._annotator, confidence=answer.confidence
+        )
+
+
+def facts_of(answer: Answer) -> Facts:
+    """What of an answer asks for care, read from the words of its scene."""
+    lead: tuple[Literal["none", "near", "far"], ...] = ("none", "near", "far")
+    said = scene_answers(answer.scene)[2]
+    return Facts(
+        condition=answer.condition,
+        dark="dark" in answer.scene or "night" in answer.scene,
+        low_sun="low sun" in answer.scene,
+        lead=lead[said] if said >= 0 else None,
+        traffic="dense" if "dense traffic" in answer.scene else None,
+    )
