@@ -3,7 +3,10 @@
 
 PYTHON ?= python3
 VENV = .venv
-RUN = runs/tiny
+# Where frames come from: synthetic, or nuscenes, images, video, mcap with ROOT=folder.
+SOURCE = synthetic
+ROOT =
+RUN = runs/$(if $(filter synthetic,$(SOURCE)),tiny,$(SOURCE))
 BASE = models/tiny
 FRAMES =
 PORT = 8470
@@ -21,6 +24,7 @@ SWEEP = $(addprefix evaluate/,sweep.py sweep_runs.py workers.py)
 LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP),$(wildcard evaluate/*.py))
 SIMULATION = $(wildcard ridetune/control/*.py ridetune/sim/*.py) configs/ranges.yaml \
 	configs/vehicle.yaml
+SYNTHETIC = $(addprefix data/,__main__.py annotate.py build.py instructions.py)
 CONTRACT = $(addprefix ridetune/,alignment.py codec.py config.py matrix.py sample.py stage.py)
 
 # Every model is a folder on this disk; nothing is looked up elsewhere.
@@ -35,7 +39,7 @@ help:  ## Print this list
 		| awk -F '|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
 
 venv: $(INSTALLED)  ## Create .venv and install everything (PYTHON=python3.12 picks another)
-data: $(RUN)/data/manifest.json  ## Build the dataset
+data: $(RUN)/data/manifest.json  ## Build the dataset (SOURCE=nuscenes ROOT=folder: from real frames)
 train: $(RUN)/merged/manifest.json  ## Fine-tune with LoRA and merge the adapter
 quantize: $(RUN)/bundle/bundle.json  ## Quantize to 4-bit AWQ and export the bundle
 bench: $(RUN)/evaluation.json  ## Profile the bundle's latency and score what it does
@@ -75,9 +79,18 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PY) -m pip install -c constraints.txt -e ".[all,dev]"
 	@touch $@
 
-$(RUN)/data/manifest.json: $(wildcard data/*.py data/bank/*.yaml ridetune/camera/*.py) $(CONTRACT) \
+ifeq ($(SOURCE),synthetic)
+$(RUN)/data/manifest.json: $(SYNTHETIC) $(wildcard data/bank/*.yaml ridetune/camera/*.py) $(CONTRACT) \
 		configs/data.yaml configs/ranges.yaml | $(INSTALLED)
 	$(PY) -m data --config configs/data.yaml out=$(RUN)/data
+else
+# Parts that are there stay; a change of the folder's content wants a new RUN.
+$(RUN)/data/manifest.json: configs/propose.yaml configs/data-export.yaml | $(INSTALLED)
+	$(PY) -m data.propose --config configs/propose.yaml \
+		source=$(SOURCE) "root='$(ROOT)'" out=$(RUN)/proposals
+	$(PY) -m data.export --config configs/data-export.yaml \
+		proposals=$(RUN)/proposals out=$(RUN)/data
+endif
 
 $(RUN)/merged/manifest.json: $(RUN)/data/manifest.json $(wildcard train/*.py) $(CONTRACT) \
 		ridetune/prompt.py ridetune/vision.py ridetune/contract.py ridetune/qwen.py \
