@@ -27,7 +27,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ridetune.config import save_config
+from ridetune.config import Share, save_config
 from ridetune.contract import Contract, load_tokenizer
 from ridetune.matrix import Ranges
 from ridetune.prompt import ACTION_TOKENS, PromptBuilder
@@ -71,6 +71,7 @@ class TinyConfig:
     as_text_share: float  # share of samples that answer the paper's way in the last stage
     text_weight: float  # weight of the text loss beside the action loss
     words_in_both: float  # text-only batches in the last stage, as a share of all
+    words_kept: Share  # weight of what stage one left, in the average at the end
 
 
 def pretrain(config: TinyConfig) -> None:
@@ -112,7 +113,8 @@ def _pretrain(config: TinyConfig) -> None:
         learn_words(task, held_out, config.words, config.seed)
         return language.state_dict()
 
-    language.load_state_dict(stages.once("words", words))
+    spoken: dict[str, Tensor] = stages.once("words", words)
+    language.load_state_dict(spoken)
     samples = read_samples(config.data / "train.parquet")
     pixels = read_pixels(samples, contract.vision)
 
@@ -122,7 +124,9 @@ def _pretrain(config: TinyConfig) -> None:
 
     if config.start is None:
         visual.load_state_dict(stages.once("pictures", pictures))
+    spoken = {name: weight.clone() for name, weight in spoken.items()}
     learn_both(model, contract, prompts, samples, pixels, task, held_out, config)
+    keep_words(language, spoken, config.words_kept)
     if not is_first():
         return
 
@@ -249,6 +253,17 @@ def learn_both(
 
     lengths = [text_length(sample) for sample in samples]
     train_steps("both", [model], lengths, loss_of, config.both, config.seed, watch=watch)
+
+
+def keep_words(language: nn.Module, spoken: dict[str, Tensor], share: float) -> None:
+    """Average the language model with what stage one left of it; `share` is the latter's weight.
+
+    Learning to look costs some understanding of words, and the average of both weights keeps most
+    of either (WiSE-FT, Wortsman et al. 2022).
+    """
+    now = language.state_dict()
+    mixed = {name: torch.lerp(now[name], spoken[name].to(now[name]), share) for name in now}
+    language.load_state_dict(mixed)
 
 
 def _corpus(phrases: list[Sample]) -> list[str]:
