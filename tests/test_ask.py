@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import pytest
 
-from data.ask.agreement import cohens_kappa
 from data.ask.answers import MAX_WIDTH_PX, Answer, Refusal, parse_answer, shrink
 from data.ask.config import AskConfig
 from data.ask.endpoint import LimitReachedError, ModelAnnotator, StoppedError
 from data.ask.replies import pause_asked
 from data.ask.run import ask
+from data.kappa import cohens_kappa
 from data.proposals import Proposal, read_proposals, write_part
 from ridetune.alignment import style_of
 from ridetune.config import load_config

@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from ..kappa import cohens_kappa
+
 
 def compare_folders(rules: Path, model: Path) -> Iterator[str]:
     """Lines on how far the styles and conditions of two folders of the same pairs agree."""
@@ -39,17 +41,3 @@ def describe_agreement(name: str, pairs: Sequence[tuple[str, str]]) -> str:
         + ("undefined" if kappa is None else f"{kappa:.3f}")
         + (f"; rules -> model: {most}" if most else "")
     )
-
-
-def cohens_kappa(pairs: Sequence[tuple[str, str]]) -> float | None:
-    """Agreement of two annotators beyond chance (Cohen 1960): (p_o - p_e) / (1 - p_e).
-
-    p_o: share of pairs that agree; p_e: share expected of each one's own frequencies. None where
-    it is undefined: no pairs, or both always say the same one thing.
-    """
-    if not pairs:
-        return None
-    first, second = (Counter(labels) for labels in zip(*pairs, strict=True))
-    observed = sum(one == other for one, other in pairs) / len(pairs)
-    chance = sum(first[label] * second[label] for label in first) / len(pairs) ** 2
-    return None if chance == 1 else (observed - chance) / (1 - chance)

@@ -1,7 +1,6 @@
 """How well first and second opinions agree: Cohen's kappa on styles, ICC(2,1) on each value.
 
-Sources: J. Cohen, A coefficient of agreement for nominal scales, Educational and Psychological
-Measurement 20, 1960; P. Shrout and J. Fleiss, Intraclass correlations: uses in assessing rater
+Source of ICC: P. Shrout and J. Fleiss, Intraclass correlations: uses in assessing rater
 reliability, Psychological Bulletin 86, 1979. "First" and "second" are places in time: with more
 than two annotators a place is held by several people, whose own habits it then averages.
 """
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from ridetune.matrix import NUM_PARAMETERS, STYLES
 
+from ..kappa import cohens_kappa
 from .settle import difference
 from .store import Review
 
@@ -54,23 +54,9 @@ def measure(opinions: Iterable[Sequence[Review]]) -> Agreement:
         kept=len(kept),
         disputed=sum(difference(pair) is not None for pair in pairs),
         styles=tuple(tuple(row) for row in table),
-        kappa=cohens_kappa(np.array(table)),
+        kappa=cohens_kappa([(first.style, second.style) for first, second in kept]),
         icc=tuple(icc_2_1(values[:, :, i]) for i in range(NUM_PARAMETERS)),
     )
-
-
-def cohens_kappa(table: NDArray[np.int_]) -> float | None:
-    """kappa = (p_o - p_e) / (1 - p_e) of counts [first, second] (Cohen 1960, Eq. 1).
-
-    p_o: share of agreement, p_e: what the marginals give by chance. None without counts, or
-    where both always gave the same category.
-    """
-    total = table.sum()
-    if not total:
-        return None
-    observed = np.trace(table) / total
-    chance = float(table.sum(axis=0) @ table.sum(axis=1)) / float(total) ** 2
-    return None if chance == 1.0 else float((observed - chance) / (1.0 - chance))
 
 
 def icc_2_1(ratings: NDArray[np.float64]) -> float | None:
