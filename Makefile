@@ -6,6 +6,8 @@ VENV = .venv
 # Where frames come from: synthetic, or nuscenes, images, video, mcap with ROOT=folder.
 SOURCE = synthetic
 ROOT =
+# What the weather was, which videos and logs do not say: sunny, rain, fog, snow or night.
+CONDITION =
 RUN = runs/$(if $(filter synthetic,$(SOURCE)),tiny,$(SOURCE))
 BASE = models/tiny
 FRAMES =
@@ -87,7 +89,8 @@ else
 # Parts that are there stay; a change of the folder's content wants a new RUN.
 $(RUN)/data/manifest.json: configs/propose.yaml configs/data-export.yaml | $(INSTALLED)
 	$(PY) -m data.propose --config configs/propose.yaml \
-		source=$(SOURCE) "root='$(ROOT)'" out=$(RUN)/proposals
+		source=$(SOURCE) "root='$(ROOT)'" out=$(RUN)/proposals \
+		$(if $(CONDITION),condition=$(CONDITION))
 	$(PY) -m data.export --config configs/data-export.yaml \
 		proposals=$(RUN)/proposals out=$(RUN)/data
 endif

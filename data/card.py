@@ -41,8 +41,10 @@ _FACETS: dict[str, tuple[str, ...]] = {
 }
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (10**6, "100K<n<1M"))
 _WARNINGS: dict[Split, str] = {
-    "calibration": "No pair is for calibration: `python -m quantize` needs some.",
-    "test": "No pair is for testing: `python -m train` watches them and refuses to run without.",
+    "calibration": "No pair is for calibration, which `python -m quantize` needs; "
+    "propose from more scenes, or with a larger calibration_share.",
+    "test": "No pair is for testing, without which `python -m train` refuses to run; "
+    "propose from more scenes, or with a larger test_share.",
 }
 
 
@@ -128,6 +130,10 @@ class Card:
             chosen, key=lambda p: (CONDITIONS.index(p.condition), STYLES.index(p.style), p)
         )
 
+    def warnings(self) -> list[str]:
+        """What the later stages will miss, in words."""
+        return [text for split, text in _WARNINGS.items() if not self.pairs(split)]
+
 
 def write_card(card: Card, folder: Path, *, name: str, skipped: Mapping[str, int]) -> None:
     """README.md, the plots and the contact sheet of a folder whose pairs are written."""
@@ -137,7 +143,7 @@ def write_card(card: Card, folder: Path, *, name: str, skipped: Mapping[str, int
     (folder / SHEET_FILE).write_bytes(draw_sheet(card.shown(), folder))
     parts = {
         "name": _cell(name),
-        "warnings": "".join(f"\n> **Note:** {_WARNINGS[s]}\n" for s in _empty(card)),
+        "warnings": "".join(f"\n> **Note:** {warning}\n" for warning in card.warnings()),
         "splits": _list(f"{s} {card.pairs(s):,}" for s in card.splits),
         "pairs": f"{sum(map(card.pairs, SPLITS)):,}",
         "vehicle": _cell(card.codec.ranges.vehicle),
@@ -166,10 +172,6 @@ def _front_matter(card: Card, name: str) -> str:
         "configs": [{"config_name": "default", "data_files": files}],
     }
     return yaml.safe_dump(matter, sort_keys=False, allow_unicode=True)
-
-
-def _empty(card: Card) -> list[Split]:
-    return [split for split in SPLITS if split in _WARNINGS and not card.pairs(split)]
 
 
 def _skipped(counts: Mapping[str, int]) -> str:

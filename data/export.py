@@ -74,6 +74,8 @@ def export(config: DataExportConfig) -> None:
         write_manifest(folder, seconds=watch.seconds, facts=facts)
     left_out = f"{skipped.counts.total()} left out"
     print(f"dataset: {counts}, {left_out}, in {config.out}, {watch.seconds:.0f} s")
+    for warning in card.warnings():
+        print(f"note: {warning}")
 
 
 class SkippedList:

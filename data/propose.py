@@ -3,8 +3,13 @@
     source -> frames, without look-alikes -> weather variants -> instructions -> labels -> proposals
 
 In: nuScenes, a folder of images, videos, a drive log or the synthetic camera. Out: a folder of
-proposals for `python -m data.review` and the build, and what was skipped and why (skipped.csv).
+proposals for `python -m data.review` and the export, and what was skipped and why (skipped.csv).
 A run that was stopped goes on where it was: finished parts are kept.
+
+A picture's condition is the name of its folder (sunny, rain, fog, snow, night), or stands in a
+frames.csv beside the folders: file, condition, dark, low_sun, road, lead, traffic, surroundings,
+speed_mps, scene. Give pictures of one drive the same `scene` there, so that the split keeps them
+together: without it each picture is a scene of its own.
 
     python -m data.propose --config configs/propose.yaml source=images root=../my-photographs
 """
@@ -16,7 +21,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
@@ -28,7 +33,7 @@ from ridetune.codec import MatrixCodec
 from ridetune.config import Count, Share, save_config
 from ridetune.gate import SafetyGate
 from ridetune.matrix import STYLES, Ranges
-from ridetune.sample import Condition, Observation, Sample, Split
+from ridetune.sample import CONDITIONS, Condition, Observation, Sample, Split
 from ridetune.stage import Stopwatch, run_stage, write_manifest
 
 from .annotate import draw_matrix, explain, shift_for_care
@@ -46,6 +51,7 @@ from .sources.synthetic import draw_scenes
 from .sources.video import read_videos
 
 ANNOTATOR = "rules-1"
+UNSTATED = "not stated"
 SKIPPED_FILE = "skipped.csv"
 CONFIG_FILE = "config.yaml"
 
@@ -82,25 +88,28 @@ def propose(config: ProposeConfig) -> None:
     """Write all parts that are not there yet, what was skipped, and the manifest."""
     watch = Stopwatch()
     _start_or_resume(config)
-    proposer = Proposer(config)
     skipped: list[Skipped] = []
-    counts: Counter[str] = Counter()
     frames = iter(tqdm(_kept(config, skipped), desc="frames", unit="frame"))
-    number = 0
-    while part := list(islice(frames, config.frames_per_part)):
-        path = config.out / f"part-{number:05d}.parquet"
-        if not path.exists():
-            write_part((p for seen in part for p in proposer.of_frame(seen)), path)
-        counts["frames"] += len(part)
-        number += 1
-    if not number:
+    parts = iter(lambda: list(islice(frames, config.frames_per_part)), [])
+    first = next(parts, None)
+    if first is None:
         reasons = Counter(skip.reason for skip in skipped).most_common(1)
         why = f"; most often: {reasons[0][0]}" if reasons else ""
         raise ValueError(f"{config.source} at {config.root} gave no usable frame{why}")
+    proposer = Proposer(config)
+    num_frames = num_parts = 0
+    for part in chain([first], parts):
+        path = config.out / f"part-{num_parts:05d}.parquet"
+        if not path.exists():
+            write_part((p for seen in part for p in proposer.of_frame(seen)), path)
+        num_frames += len(part)
+        num_parts += 1
     _write_skipped(skipped, config.out)
-    facts = {"frames": counts["frames"], "skipped": len(skipped), "parts": number}
+    facts = {"frames": num_frames, "skipped": len(skipped), "parts": num_parts}
     write_manifest(config.out, seconds=watch.seconds, facts=facts)
     print(f"proposals: {facts} in {config.out}, {watch.seconds:.0f} s")
+    if licence_of(config) == UNSTATED:
+        print("note: their licence is not stated; licence=... puts it into the dataset's card")
 
 
 def open_source(config: ProposeConfig) -> Frames:
@@ -113,6 +122,11 @@ def open_source(config: ProposeConfig) -> Frames:
         raise ValueError(f"the source {config.source!r} needs root=..., the folder to read from")
     if config.source == "nuscenes":
         return read_nuscenes(config.root, stride=config.stride)
+    if config.source in ("video", "mcap") and config.condition is None:
+        raise ValueError(
+            f"a {config.source} does not say what the weather was; "
+            f"set condition= to one of {', '.join(CONDITIONS)}, and propose other weathers apart"
+        )
     if config.source == "video":
         return read_videos(
             config.root, condition=config.condition, every_s=config.every_s, change=config.change
@@ -188,10 +202,20 @@ class Proposer:
             scene_id=f"{self._config.source}/{seen.scene_id}",
             phrase_id=phrase.phrase_id,
         )
-        licence = NUSCENES_LICENCE if self._config.source == "nuscenes" else self._config.licence
         return Proposal(
-            sample, self._config.source, licence, picture.name, ANNOTATOR, _known_share(facts)
+            sample,
+            self._config.source,
+            licence_of(self._config),
+            picture.name,
+            ANNOTATOR,
+            _known_share(facts),
         )
+
+
+def licence_of(config: ProposeConfig) -> str:
+    """What may be done with the frames: what nuScenes and the synthetic camera say, or the user."""
+    own = {"nuscenes": NUSCENES_LICENCE, "synthetic": "Apache-2.0, drawn by ridetune"}
+    return own.get(config.source, config.licence)
 
 
 def split_of(scene_id: str, test_share: float, calibration_share: float) -> Split:
@@ -223,7 +247,7 @@ def _fault_of(seen: Seen, lookalikes: Lookalikes) -> Skipped | None:
         return Skipped(
             seen.name,
             "its condition is not known: name its folder sunny, rain, fog, snow or night, "
-            "list it in frames.csv, or give condition=... for videos and logs",
+            "or list it in frames.csv",
         )
     twin = lookalikes.find_or_add(seen.name, difference_hash(seen.observation.frame))
     return None if twin is None else Skipped(seen.name, f"it looks like {twin}")
@@ -245,7 +269,8 @@ def _start_or_resume(config: ProposeConfig) -> None:
     path = config.out / CONFIG_FILE
     partial = config.out / f".{CONFIG_FILE}"
     save_config(config, partial)
-    if path.exists() and yaml.safe_load(path.read_text()) != yaml.safe_load(partial.read_text()):
+    begun = path.exists() and any(config.out.glob("part-*.parquet"))
+    if begun and yaml.safe_load(path.read_text()) != yaml.safe_load(partial.read_text()):
         partial.unlink()
         raise ValueError(
             f"{config.out} holds proposals of another config; delete it, or name a new `out`"

@@ -145,6 +145,19 @@ def test_a_source_needs_its_root_and_the_synthetic_camera_its_limit(tmp_path: Pa
         propose(config_of(tmp_path / "b", source="synthetic"))
 
 
+def test_a_video_needs_to_be_told_the_weather(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="condition="):
+        propose(config_of(tmp_path, source="video"))
+
+
+def test_a_run_that_made_nothing_may_be_corrected(tmp_path: Path) -> None:
+    photograph(tmp_path / "frames" / "nice.png", "fog", 1)
+    with pytest.raises(ValueError, match="not known"):
+        propose(config_of(tmp_path))
+    photograph(tmp_path / "frames" / "fog" / "nice.png", "fog", 2)
+    propose(config_of(tmp_path, seed=9))
+
+
 def test_the_synthetic_camera_knows_everything_of_its_scenes(tmp_path: Path) -> None:
     made = proposals_of(config_of(tmp_path, source="synthetic", limit=4, variants_per_frame=0))
     assert {p.confidence for p in made} == {1.0}
