@@ -11,10 +11,11 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ridetune.camera.render import render
@@ -204,13 +205,13 @@ def remember(
     return Remembered(tuple(memories), kind)
 
 
-def encode(pixels: Any) -> bytes:
+def encode(pixels: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
     """RGB pixels [height, width, 3] -> JPEG bytes."""
     done, jpeg = cv2.imencode(
-        ".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        ".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
     assert done
-    return jpeg.tobytes()
+    return bytes(jpeg.tobytes())
 
 
 def _write_feedback(bank: Bank, folder: Path) -> None:

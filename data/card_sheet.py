@@ -16,6 +16,8 @@ from ridetune.matrix import Style
 from ridetune.sample import Condition
 from ridetune.vision import decode_frame
 
+from .build import encode
+
 _TILE, _CAPTION, _GAP, _COLUMNS = (320, 180), 74, 12, 6
 _SHEET, _BEHIND, _INK = (24, 27, 31), (14, 17, 20), (231, 233, 236)  # RGB
 _COLOURS: dict[Style, tuple[int, int, int]] = {
@@ -49,10 +51,7 @@ def draw_sheet(shown: Sequence[Shown], folder: Path) -> bytes:
         top = _GAP + row * (_TILE[1] + _CAPTION + _GAP)
         sheet[top : top + _TILE[1], left : left + _TILE[0]] = _tile(folder / pair.image)
         _caption(sheet, pair, left, top + _TILE[1])
-    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    done, jpeg = cv2.imencode(".jpg", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), quality)
-    assert done
-    return bytes(jpeg.tobytes())
+    return encode(sheet, _JPEG_QUALITY)
 
 
 def _tile(path: Path) -> NDArray[np.uint8]:

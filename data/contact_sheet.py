@@ -16,11 +16,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from data.sources.images import read_images
-from data.sources.seen import Seen, Skipped
-from data.variants import MIN_SIDE, VARIANTS, vary_weather
 from ridetune.camera.weather import Image
 from ridetune.vision import decode_frame
+
+from .sources.images import read_images
+from .sources.seen import Seen, Skipped
+from .variants import MIN_SIDE, VARIANTS, vary_weather
 
 CAPTION_PX = 20  # height of the line over all columns, and of the line over each row
 _ENDINGS = (".jpg", ".jpeg", ".png")

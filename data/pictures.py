@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ridetune.sample import Split
 from ridetune.vision import decode_frame
 
+from .build import encode
 from .sources.seen import Facts, Seen
 from .variants import VARIANTS, Variant, vary_weather
 
@@ -39,7 +39,7 @@ def pictures_of(
     if width > max_width:
         size = (max_width, round(height * max_width / width))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-        frame = _encode(pixels)
+        frame = encode(pixels, JPEG_QUALITY)
     yield Picture(seen.name, frame, seen.facts)
     if seen.facts.condition != "sunny" or seen.facts.low_sun:
         return
@@ -49,18 +49,12 @@ def pictures_of(
         chosen = [VARIANTS[i] for i in sorted(rng.permutation(len(VARIANTS))[:count])]
     for variant in chosen:
         varied = vary_weather(pixels, variant, rng)
-        yield Picture(f"{seen.name}+{variant}", _encode(varied), _in_weather(seen.facts, variant))
+        yield Picture(
+            f"{seen.name}+{variant}", encode(varied, JPEG_QUALITY), _in_weather(seen.facts, variant)
+        )
 
 
 def _in_weather(facts: Facts, variant: Variant) -> Facts:
     if variant == "low_sun":
         return replace(facts, low_sun=True)
     return replace(facts, condition=variant, dark=variant == "night")
-
-
-def _encode(pixels: NDArray[np.uint8]) -> bytes:
-    done, jpeg = cv2.imencode(
-        ".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    )
-    assert done
-    return bytes(jpeg.tobytes())

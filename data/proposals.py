@@ -6,7 +6,7 @@ A folder of proposals holds parts (part-00000.parquet, ...), each written whole 
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,15 +65,36 @@ def read_proposals(folder: Path) -> Iterator[Proposal]:
 
     ValueError where there are none or a part is damaged.
     """
-    import pyarrow.parquet as parquet
-    from pyarrow import ArrowInvalid
+    for path in part_paths(folder):
+        yield from read_part(path)
 
+
+def part_paths(folder: Path) -> list[Path]:
+    """The parts of a folder of proposals, in order; ValueError where there are none."""
     paths = sorted(folder.glob("part-*.parquet"))
     if not paths:
         raise ValueError(f"{folder} holds no proposals; run `python -m data.propose` first")
-    for path in paths:
-        try:
-            rows = parquet.read_table(path).to_pylist()
-        except (OSError, ArrowInvalid) as error:
-            raise ValueError(f"{path} is damaged ({error}); propose again") from error
-        yield from map(Proposal.of_row, rows)
+    return paths
+
+
+def read_part(path: Path) -> list[Proposal]:
+    """The proposals of one part; ValueError where it is damaged."""
+    import pyarrow.parquet as parquet
+
+    return [Proposal.of_row(row) for row in _whole(parquet.read_table, path).to_pylist()]
+
+
+def num_rows(paths: Sequence[Path]) -> int:
+    """How many proposals the parts hold; ValueError where one is damaged."""
+    import pyarrow.parquet as parquet
+
+    return sum(_whole(parquet.read_metadata, path).num_rows for path in paths)
+
+
+def _whole(read: Callable[[Path], Any], path: Path) -> Any:
+    from pyarrow import ArrowInvalid
+
+    try:
+        return read(path)
+    except (OSError, ArrowInvalid) as error:
+        raise ValueError(f"{path} is damaged ({error}); propose again") from error

@@ -111,7 +111,7 @@ def _pretrain(config: TinyConfig) -> None:
 
     def words() -> Any:
         learn_words(task, held_out, config.words, config.seed)
-        return language.state_dict()
+        return {name: weight.clone() for name, weight in language.state_dict().items()}
 
     spoken: dict[str, Tensor] = stages.once("words", words)
     language.load_state_dict(spoken)
@@ -124,7 +124,6 @@ def _pretrain(config: TinyConfig) -> None:
 
     if config.start is None:
         visual.load_state_dict(stages.once("pictures", pictures))
-    spoken = {name: weight.clone() for name, weight in spoken.items()}
     learn_both(model, contract, prompts, samples, pixels, task, held_out, config)
     keep_words(language, spoken, config.words_kept)
     if not is_first():

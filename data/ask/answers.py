@@ -120,7 +120,7 @@ def shrink(frame: bytes) -> bytes:
     if width > MAX_WIDTH_PX:
         size = (MAX_WIDTH_PX, max(1, round(height * MAX_WIDTH_PX / width)))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return bytes(encode(pixels))
+    return encode(pixels)
 
 
 def first_messages(prompt: str, jpeg: bytes, instruction: str) -> Messages:

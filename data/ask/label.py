@@ -1,10 +1,11 @@
 """What an answer makes of a proposal: the model's words, and a matrix drawn by the rules."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 
+from ridetune.camera.scene import Lead
 from ridetune.codec import MatrixCodec
 from ridetune.gate import SafetyGate
 from ridetune.matrix import Ranges
@@ -48,7 +49,7 @@ class Labeller:
 
 def facts_of(answer: Answer) -> Facts:
     """What of an answer asks for care, read from the words of its scene."""
-    lead: tuple[Literal["none", "near", "far"], ...] = ("none", "near", "far")
+    lead: tuple[Lead, ...] = get_args(Lead)
     said = scene_answers(answer.scene)[2]
     return Facts(
         condition=answer.condition,

@@ -10,13 +10,13 @@ from ridetune.config import save_config
 from ridetune.matrix import Ranges
 from ridetune.stage import Stopwatch, write_manifest
 
-from ..proposals import Proposal, write_part
+from ..proposals import Proposal, num_rows, part_paths, read_part, write_part
 from .agreement import compare_folders
 from .answers import Answer
 from .config import AskConfig
 from .endpoint import LimitReachedError, ModelAnnotator
 from .label import Labeller
-from .parts import Skip, num_rows, part_paths, read_part, read_skips, write_skips
+from .skips import Skip, read_skips, write_skips
 
 CONFIG_FILE = "config.yaml"
 

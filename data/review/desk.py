@@ -5,11 +5,11 @@ One lock orders all answers: what is checked is still true when it is written.
 
 from threading import Lock
 
-from data.proposals import Proposal
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import STYLES, ControllerMatrix, Ranges, ki_limit
 from ridetune.sample import Condition
 
+from ..proposals import Proposal
 from .agreement import measure
 from .index import ProposalIndex
 from .preview import Previewer

@@ -20,8 +20,13 @@ from .seen import Facts, Frames, Seen, Skipped, fault_of_frame
 
 ENDINGS = (".jpg", ".jpeg", ".png")
 LIST = "frames.csv"
-# What people call clear daylight.
-_ALSO: dict[str, Condition] = {"overcast": "sunny", "clear": "sunny", "day": "sunny"}
+# Names of folders; the last three are what people call clear daylight.
+_NAMED: dict[str, Condition] = {
+    **{condition: condition for condition in CONDITIONS},
+    "overcast": "sunny",
+    "clear": "sunny",
+    "day": "sunny",
+}
 
 
 class Line(BaseModel):
@@ -76,12 +81,8 @@ def _seen(root: Path, name: str, line: Line | None) -> Seen | Skipped:
 
 def _condition_of(name: str) -> Condition | None:
     for folder in reversed(Path(name).parts[:-1]):
-        word = folder.lower()
-        for condition in CONDITIONS:
-            if word == condition:
-                return condition
-        if word in _ALSO:
-            return _ALSO[word]
+        if folder.lower() in _NAMED:
+            return _NAMED[folder.lower()]
     return None
 
 

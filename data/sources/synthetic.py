@@ -3,25 +3,20 @@
 In: a number of frames and a seed. Out: a `Seen` for each, in a random condition.
 """
 
-import cv2
 import numpy as np
 
 from ridetune.camera.render import render
 from ridetune.camera.scene import sample_scene
 from ridetune.sample import Observation
 
+from ..build import encode
 from .seen import Facts, Frames, Seen
-
-JPEG_QUALITY = 88
 
 
 def draw_scenes(count: int, *, seed: int, width: int = 448, height: int = 256) -> Frames:
     """That many frames; the first ones are the same for any count."""
     for number in range(count):
         scene = sample_scene(np.random.default_rng([seed, number]))
-        picture = cv2.cvtColor(render(scene, width, height), cv2.COLOR_RGB2BGR)
-        done, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        assert done
         facts = Facts(
             condition=scene.condition,
             dark=scene.condition == "night",
@@ -31,4 +26,4 @@ def draw_scenes(count: int, *, seed: int, width: int = 448, height: int = 256) -
             surroundings=scene.surroundings,
         )
         name = f"synthetic-{number:06d}"
-        yield Seen(name, name, Observation(jpeg.tobytes()), facts)
+        yield Seen(name, name, Observation(encode(render(scene, width, height))), facts)

@@ -1,44 +1,14 @@
-"""The parts of a folder of proposals as they are read, and the list of what got no answer."""
+"""The list of the pairs that got no answer."""
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 from ..proposals import Proposal
 from .answers import Refusal
 
 SKIPPED_FILE = "skipped.csv"
-
-
-def part_paths(folder: Path) -> list[Path]:
-    """The parts of a folder of proposals, in order; ValueError where there are none."""
-    paths = sorted(folder.glob("part-*.parquet"))
-    if not paths:
-        raise ValueError(f"{folder} holds no proposals; run `python -m data.propose` first")
-    return paths
-
-
-def num_rows(paths: Sequence[Path]) -> int:
-    """How many proposals the parts hold."""
-    import pyarrow.parquet as parquet
-
-    return sum(_whole(parquet.read_metadata, path).num_rows for path in paths)
-
-
-def read_part(path: Path) -> list[Proposal]:
-    """The proposals of one part."""
-    import pyarrow.parquet as parquet
-
-    return [Proposal.of_row(row) for row in _whole(parquet.read_table, path).to_pylist()]
-
-
-def _whole(read: Callable[[Path], Any], path: Path) -> Any:
-    try:
-        return read(path)
-    except OSError as error:
-        raise ValueError(f"{path} is damaged ({error}); propose again") from error
 
 
 @dataclass(frozen=True)
