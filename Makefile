@@ -22,7 +22,7 @@ BENCHMARK = quantize/benchmark.py quantize/served_memory.py
 REPORT = $(addprefix evaluate/,__main__.py report.py alignment.py decisions.py)
 PAGE = $(wildcard evaluate/page_parts/*) $(addprefix evaluate/,page.py animation.py curves.py \
 	plots.py sections.py style_drives.py tables.py)
-SWEEP = $(addprefix evaluate/,sweep.py sweep_runs.py workers.py)
+SWEEP = $(addprefix evaluate/,sweep.py sweep_runs.py)
 LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP),$(wildcard evaluate/*.py))
 SIMULATION = $(wildcard ridetune/control/*.py ridetune/sim/*.py) configs/ranges.yaml \
 	configs/vehicle.yaml

@@ -1,6 +1,6 @@
 """Many closed-loop runs over scenarios, conditions and styles, on one core or on many machines.
 
-ranges + vehicle -> runs (evaluate/sweep_runs.py) on workers (evaluate/workers.py) -> sweep.json:
+ranges + vehicle -> runs (evaluate/sweep_runs.py) on workers (ridetune/workers.py) -> sweep.json:
 per cell the counts of safe and unsafe runs with Clopper-Pearson intervals and quantiles of the
 metrics, and the rate of each backend on the same runs. The last line is one JSON object.
 
@@ -30,10 +30,10 @@ from ridetune.matrix import Ranges, Style
 from ridetune.sample import Condition
 from ridetune.sim.scenarios import SCENARIOS
 from ridetune.stage import run_stage
+from ridetune.workers import Backend, run_tasks
 
 from .significance import clopper_pearson
 from .sweep_runs import METRICS, Cell, Outcome, Task, drive_task
-from .workers import Backend, run_tasks
 
 SAFE = ("finished", "stopped")
 QUANTILES = (0.05, 0.5, 0.95)

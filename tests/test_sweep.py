@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ import pytest
 from evaluate.significance import clopper_pearson
 from evaluate.sweep import SAFE, SweepConfig, plan_tasks, summarise, sweep
 from evaluate.sweep_runs import METRICS, Cell, Outcome, draw_run, drive_task
-from evaluate.workers import Backend, run_tasks
 from ridetune.codec import MatrixCodec
 from ridetune.config import load_config
 from ridetune.matrix import STYLES, Ranges, ki_limit
@@ -19,6 +19,7 @@ from ridetune.sim.metrics import measure
 from ridetune.sim.rollout import rollout
 from ridetune.sim.scenarios import SCENARIOS
 from ridetune.stage import run_stage
+from ridetune.workers import Backend, run_tasks
 from tests.shipped_car import VEHICLE
 
 SMALL = [
@@ -55,6 +56,16 @@ def test_every_run_is_planned_once_and_cells_stay_together(root: Path) -> None:
     assert [t.count for t in tasks] == [2, 1] * 8
     cells = [t.cell for t in tasks]
     assert cells == sorted(cells, key=cells.index)
+
+
+@pytest.mark.parametrize("backend", ["serial", "joblib"])
+def test_an_error_among_the_tasks_reaches_whoever_asks(backend: Backend) -> None:
+    def tasks() -> Iterator[int]:
+        yield from range(-20, 0)
+        raise ValueError("the source broke off")
+
+    with pytest.raises(ValueError, match="the source broke off"):
+        list(run_tasks(abs, tasks(), backend=backend, workers=2))
 
 
 @pytest.mark.parametrize("style", STYLES)

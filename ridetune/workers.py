@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from joblib import Parallel, delayed
-
 Backend = Literal["serial", "joblib", "ray"]
 TaskType = TypeVar("TaskType")
 Result = TypeVar("Result")
@@ -41,15 +39,30 @@ def run_tasks(
     if backend == "ray":
         return _run_on_ray(work, tasks, workers, address)
     if backend == "joblib":
-        parallel = Parallel(
-            n_jobs=workers,
-            return_as="generator",
-            batch_size=1,
-            pre_dispatch=_AHEAD * workers,
-        )
-        results: Iterator[Result] = parallel(delayed(work)(task) for task in tasks)
-        return results
+        return _run_on_cores(work, tasks, workers)
     return map(work, tasks)
+
+
+def _run_on_cores(
+    work: Callable[[TaskType], Result], tasks: Iterable[TaskType], workers: int
+) -> Iterator[Result]:
+    from joblib import Parallel, delayed
+
+    failed: list[Exception] = []
+
+    def guarded() -> Iterator[TaskType]:
+        # joblib asks for tasks in a thread of its own, where an error would be lost.
+        try:
+            yield from tasks
+        except Exception as error:  # noqa: BLE001
+            failed.append(error)
+
+    parallel = Parallel(
+        n_jobs=workers, return_as="generator", batch_size=1, pre_dispatch=_AHEAD * workers
+    )
+    yield from parallel(delayed(work)(task) for task in guarded())
+    if failed:
+        raise failed[0]
 
 
 def _run_on_ray(
@@ -58,7 +71,9 @@ def _run_on_ray(
     workers: int,
     address: str | None,
 ) -> Iterator[Result]:
-    ray = _start_ray(workers, address)
+    # Workers elsewhere get the code of this checkout; they need the same packages as here.
+    packages = {"ridetune", work.__module__.partition(".")[0]}
+    ray = _start_ray(workers, address, sorted(packages))
     try:
         remote = ray.remote(work)
         waiting: deque[Any] = deque()
@@ -72,7 +87,7 @@ def _run_on_ray(
         ray.shutdown()
 
 
-def _start_ray(workers: int, address: str | None) -> Any:
+def _start_ray(workers: int, address: str | None, packages: list[str]) -> Any:
     try:
         import ray
     except ImportError as error:
@@ -80,13 +95,11 @@ def _start_ray(workers: int, address: str | None) -> Any:
             "Ray is not installed; pip install -c constraints.txt -e '.[scale]', or take "
             "backend=joblib, which is enough for one machine"
         ) from error
-    # Workers elsewhere get the code of this checkout; they need Python and numba only.
-    packages = [str(_ROOT / "ridetune"), str(_ROOT / "evaluate")]
     ray.init(
         address=address,
         num_cpus=None if address else workers,
         include_dashboard=None if address else False,
         log_to_driver=False,
-        runtime_env={"py_modules": packages},
+        runtime_env={"py_modules": [str(_ROOT / package) for package in packages]},
     )
     return ray
