@@ -8,12 +8,17 @@ SOURCE = synthetic
 ROOT =
 # What the weather was, which videos and logs do not say: sunny, rain, fog, snow or night.
 CONDITION =
+# In which languages the passengers speak (LANGUAGES=en,de,es,zh), and a CSV file of your own
+# commands: text, style, level, intent, language.
+LANGUAGES = en
+COMMANDS =
 RUN = runs/$(if $(filter synthetic,$(SOURCE)),tiny,$(SOURCE))
 BASE = models/tiny
 FRAMES =
 PORT = 8470
 
 PY = $(VENV)/bin/python
+SPEECH = "speech.languages=[$(LANGUAGES)]" $(if $(COMMANDS),"speech.own='$(COMMANDS)'")
 INSTALLED = $(VENV)/.installed
 LIBRARY = $(wildcard ridetune/*.py ridetune/*/*.py)
 EXPORT = $(addprefix quantize/,export.py graphs.py onnx_files.py operators.py parity.py)
@@ -26,7 +31,8 @@ SWEEP = $(addprefix evaluate/,sweep.py sweep_runs.py)
 LOOP = $(filter-out evaluate/report.py $(PAGE) $(SWEEP),$(wildcard evaluate/*.py))
 SIMULATION = $(wildcard ridetune/control/*.py ridetune/sim/*.py) configs/ranges.yaml \
 	configs/vehicle.yaml
-SYNTHETIC = $(addprefix data/,__main__.py annotate.py build.py instructions.py)
+SYNTHETIC = $(addprefix data/,__main__.py annotate.py bank_files.py build.py feedback.py held_out.py \
+	instructions.py own_commands.py phrases.py)
 CONTRACT = $(addprefix ridetune/,alignment.py codec.py config.py matrix.py sample.py stage.py)
 
 # Every model is a folder on this disk; nothing is looked up elsewhere.
@@ -82,15 +88,15 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@touch $@
 
 ifeq ($(SOURCE),synthetic)
-$(RUN)/data/manifest.json: $(SYNTHETIC) $(wildcard data/bank/*.yaml ridetune/camera/*.py) $(CONTRACT) \
+$(RUN)/data/manifest.json: $(SYNTHETIC) $(wildcard data/bank/*.yaml data/bank/*/*.yaml ridetune/camera/*.py) $(CONTRACT) \
 		configs/data.yaml configs/ranges.yaml | $(INSTALLED)
-	$(PY) -m data --config configs/data.yaml out=$(RUN)/data
+	$(PY) -m data --config configs/data.yaml out=$(RUN)/data $(SPEECH)
 else
 # Parts that are there stay; a change of the folder's content wants a new RUN.
 $(RUN)/data/manifest.json: configs/propose.yaml configs/data-export.yaml | $(INSTALLED)
 	$(PY) -m data.propose --config configs/propose.yaml \
 		source=$(SOURCE) "root='$(ROOT)'" out=$(RUN)/proposals \
-		$(if $(CONDITION),condition=$(CONDITION))
+		$(if $(CONDITION),condition=$(CONDITION)) $(SPEECH)
 	$(PY) -m data.export --config configs/data-export.yaml \
 		proposals=$(RUN)/proposals out=$(RUN)/data
 endif

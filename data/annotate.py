@@ -9,7 +9,8 @@ import numpy as np
 
 from ridetune.alignment import CONSERVATIVE_SIGN
 from ridetune.codec import MatrixCodec
-from ridetune.matrix import ControllerMatrix, Style, ki_limit
+from ridetune.gate import SafetyGate
+from ridetune.matrix import ControllerMatrix, Ranges, Style, ki_limit
 from ridetune.sample import Condition, FeedbackKind
 
 from .sources.seen import Facts
@@ -53,6 +54,25 @@ _TASTE: dict[FeedbackKind, str] = {
     "just_right": ", as you liked it last time",
     "too_conservative": ", brisker than last time",
 }
+
+
+class Rules:
+    """Labels by rule for one vehicle; the gate accepts each."""
+
+    def __init__(self, ranges: Ranges) -> None:
+        self._codec = MatrixCodec(ranges)
+        self._gate = SafetyGate(ranges, self._codec)
+
+    def label(
+        self, style: Style, facts: Facts, speed_mps: float | None, rng: np.random.Generator
+    ) -> ControllerMatrix:
+        """A matrix of the style, drawn for what is known of the scene and the speed [m/s]."""
+        assert facts.condition is not None, "frames of unknown condition are skipped"
+        care = shift_for_care(facts, speed_mps)
+        matrix = draw_matrix(style, facts.condition, None, self._codec, rng, care=care)
+        verdict = self._gate.judge(matrix, matrix)
+        assert verdict.outcome == "accepted", verdict.reasons
+        return matrix
 
 
 def draw_matrix(

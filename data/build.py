@@ -35,11 +35,12 @@ from ridetune.sample import (
 from ridetune.stage import Stopwatch, new_folder, write_manifest
 
 from .annotate import draw_matrix, explain
-from .instructions import Bank, Phrase, load_bank, pick, vary
+from .feedback import write_feedback
+from .instructions import Speakers, Speech, fill, pick, read_own
+from .phrases import Bank, Phrase, load_bank, load_reasons
 
 JPEG_QUALITY = 88
 _SPLIT_SEED: dict[Split, int] = {"train": 0, "calibration": 1, "test": 2}
-_FEEDBACK_SPLITS: tuple[Split, ...] = ("train", "test")
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class DataConfig:
     test_scenes: Count
     instructions_per_frame: Count
     memory_share: Share
-    grammar_share: Share
+    speech: Speech
     phrases: Count
     frame_width: Count
     frame_height: Count
@@ -71,31 +72,25 @@ class Remembered:
 def build(config: DataConfig) -> None:
     """Write the dataset folder; an interrupted build leaves nothing behind."""
     watch = Stopwatch()
-    bank = load_bank()
+    speakers = Speakers(config.speech, read_own(config.speech))
     codec = MatrixCodec(Ranges.load(config.ranges))
     with new_folder(config.out) as folder:
         counts = {
-            split: _write_split(split, config, bank, codec, folder)
+            split: _write_split(split, config, speakers, codec, folder)
             for split in ("train", "calibration", "test")
         }
-        _write_feedback(bank, folder)
+        write_feedback(config.speech.languages, folder)
         if config.phrases:
-            counts["phrases"] = _write_phrases(config, bank, codec, folder)
-            counts["held-out phrases"] = _write_held_out(config, bank, codec, folder)
+            counts["phrases"] = _write_phrases(config, speakers, codec, folder)
+            counts["held-out phrases"] = _write_held_out(config, speakers, codec, folder)
         save_config(config, folder / "config.yaml")
-        facts = {
-            "samples": counts,
-            "bank": {
-                "phrases": len(bank.phrases),
-                "held_out": sum(p.held_out for p in bank.phrases),
-            },
-        }
+        facts = {"samples": counts, "bank": speakers.about()}
         write_manifest(folder, seconds=watch.seconds, facts=facts)
     print(f"dataset: {counts} in {config.out}, {watch.seconds:.0f} s")
 
 
 def _write_split(
-    split: Split, config: DataConfig, bank: Bank, codec: MatrixCodec, folder: Path
+    split: Split, config: DataConfig, speakers: Speakers, codec: MatrixCodec, folder: Path
 ) -> int:
     from datasets import Dataset
 
@@ -112,7 +107,7 @@ def _write_split(
         for number in tqdm(
             range(scenes), desc=f"{split} scenes", unit="scene", disable=scenes < 100
         )
-        for sample in _scene_samples(f"{split}-{number:06d}", split, config, bank, codec, rng)
+        for sample in _scene_samples(f"{split}-{number:06d}", split, config, speakers, codec, rng)
     ]
     if rows:
         dataset = Dataset.from_list(rows, features=dataset_features())
@@ -124,26 +119,29 @@ def _scene_samples(
     scene_id: str,
     split: Split,
     config: DataConfig,
-    bank: Bank,
+    speakers: Speakers,
     codec: MatrixCodec,
     rng: np.random.Generator,
 ) -> Iterator[Sample]:
     """One scene's samples: a test scene is seen in every condition with the same instructions."""
     scene = sample_scene(rng)
     styles = [STYLES[i % len(STYLES)] for i in _shuffled(config.instructions_per_frame, rng)]
-    drawn = [draw_instruction(style, split, config.grammar_share, bank, rng) for style in styles]
+    banks = [speakers.bank(rng) for _ in styles]
+    drawn = [
+        speakers.draw(bank, style, split, rng) for bank, style in zip(banks, styles, strict=True)
+    ]
     pasts = [
-        remember(style, split, bank, codec, rng)
+        remember(style, split, speakers, bank, codec, rng)
         if split != "test" and rng.random() < config.memory_share
         else Remembered((), None)
-        for style in styles
+        for bank, style in zip(banks, styles, strict=True)
     ]
     conditions = CONDITIONS if split == "test" else (scene.condition,)
     for condition in conditions:
         seen = with_condition(scene, condition)
         frame = encode(render(seen, config.frame_width, config.frame_height))
         for (phrase, text), past in zip(drawn, pasts, strict=True):
-            yield _sample(scene_id, split, seen, frame, phrase, text, past, bank, codec, rng)
+            yield _sample(scene_id, split, seen, frame, phrase, text, past, codec, rng)
 
 
 def _sample(
@@ -154,11 +152,10 @@ def _sample(
     phrase: Phrase,
     text: str,
     past: Remembered,
-    bank: Bank,
     codec: MatrixCodec,
     rng: np.random.Generator,
 ) -> Sample:
-    reason = bank.reasons[phrase.intent][phrase.style]
+    reason = load_reasons()[phrase.intent][phrase.style]
     return Sample(
         observation=Observation(frame),
         instruction=text,
@@ -173,34 +170,26 @@ def _sample(
         split=split,
         scene_id=scene_id,
         phrase_id=phrase.phrase_id,
+        language=phrase.language,
     )
 
 
-def draw_instruction(
-    style: Style, split: Split, grammar_share: float, bank: Bank, rng: np.random.Generator
-) -> tuple[Phrase, str]:
-    """A phrase of the style with its final wording; test wordings are held out and unvaried."""
-    if split == "test":
-        phrase = pick(bank.choose(style, "test"), rng)
-        return phrase, bank.fill(phrase, rng)
-    if rng.random() < grammar_share:
-        phrase = bank.grown_phrase(style, rng)
-    else:
-        phrase = pick(bank.choose(style, "train"), rng)
-    return phrase, vary(bank.fill(phrase, rng), rng)
-
-
 def remember(
-    style: Style, split: Split, bank: Bank, codec: MatrixCodec, rng: np.random.Generator
+    style: Style,
+    split: Split,
+    speakers: Speakers,
+    bank: Bank,
+    codec: MatrixCodec,
+    rng: np.random.Generator,
 ) -> Remembered:
-    """One or two remembered drives of the same style, with feedback of one kind."""
+    """One or two remembered drives of the same style and language, with feedback of one kind."""
     kind = pick(FEEDBACK_KINDS, rng)
     memories = []
     for _ in range(1 + (rng.random() < 0.25)):
         scene = sample_scene(rng)
-        _, said = draw_instruction(style, split, 0.3, bank, rng)
+        _, said = speakers.draw(bank, style, split, rng)
         matrix = draw_matrix(style, scene.condition, None, codec, rng)
-        feedback = pick(bank.feedback_of(kind, split), rng)
+        feedback = pick(bank.feedback.of(kind, split), rng)
         memories.append(Memory(said, describe(scene), matrix, feedback))
     return Remembered(tuple(memories), kind)
 
@@ -214,39 +203,35 @@ def encode(pixels: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
     return bytes(jpeg.tobytes())
 
 
-def _write_feedback(bank: Bank, folder: Path) -> None:
-    """The feedback sentences by kind, and apart those that no training row holds."""
-    for split in _FEEDBACK_SPLITS:
-        sayings = {kind: bank.feedback_of(kind, split) for kind in FEEDBACK_KINDS}
-        (folder / f"feedback-{split}.json").write_text(json.dumps(sayings, indent=2) + "\n")
-
-
-def _write_phrases(config: DataConfig, bank: Bank, codec: MatrixCodec, folder: Path) -> int:
+def _write_phrases(config: DataConfig, speakers: Speakers, codec: MatrixCodec, folder: Path) -> int:
     """Text-only rows: instruction, memories and the label of a clear scene."""
     rng = np.random.default_rng([config.seed, 3])
     with (folder / "phrases.jsonl").open("w") as file:
         for number in tqdm(range(config.phrases), desc="phrases", unit="row"):
             style = STYLES[number % len(STYLES)]
             past = Remembered((), None)
+            bank = speakers.bank(rng)
             if rng.random() < config.memory_share:
-                past = remember(style, "train", bank, codec, rng)
-            phrase, text = draw_instruction(style, "train", config.grammar_share, bank, rng)
+                past = remember(style, "train", speakers, bank, codec, rng)
+            phrase, text = speakers.draw(bank, style, "train", rng)
             if rng.random() < 0.15:
-                _, more = draw_instruction(style, "train", 0.3, bank, rng)
+                _, more = speakers.draw(bank, style, "train", rng)
                 text = f"{text.rstrip('.')}. {more}"
-            _write_text_row(file, number, "train", phrase, text, past, bank, codec, rng)
+            _write_text_row(file, number, "train", phrase, text, past, codec, rng)
     return config.phrases
 
 
-def _write_held_out(config: DataConfig, bank: Bank, codec: MatrixCodec, folder: Path) -> int:
+def _write_held_out(
+    config: DataConfig, speakers: Speakers, codec: MatrixCodec, folder: Path
+) -> int:
     """Every held-out phrase once, to score the understanding of words alone."""
     rng = np.random.default_rng([config.seed, 4])
-    phrases = [phrase for style in STYLES for phrase in bank.choose(style, "test")]
+    phrases = [p for style in STYLES for p in speakers.phrases if p.held_out and p.style == style]
     with (folder / "phrases-test.jsonl").open("w") as file:
         for number, phrase in enumerate(phrases):
-            text = bank.fill(phrase, rng)
+            text = fill(phrase.text, load_bank(phrase.language), rng)
             past = Remembered((), None)
-            _write_text_row(file, number, "test", phrase, text, past, bank, codec, rng)
+            _write_text_row(file, number, "test", phrase, text, past, codec, rng)
     return len(phrases)
 
 
@@ -257,13 +242,12 @@ def _write_text_row(
     phrase: Phrase,
     text: str,
     past: Remembered,
-    bank: Bank,
     codec: MatrixCodec,
     rng: np.random.Generator,
 ) -> None:
     scene = replace(sample_scene(rng), condition="sunny")
     name = f"phrase-{split}-{number:06d}"
-    row = _sample(name, split, scene, b"", phrase, text, past, bank, codec, rng).as_row()
+    row = _sample(name, split, scene, b"", phrase, text, past, codec, rng).as_row()
     del row["image"]
     file.write(json.dumps(row) + "\n")
 

@@ -19,6 +19,7 @@ from ridetune.codec import MatrixCodec
 from ridetune.matrix import NUM_PARAMETERS, STYLES
 from ridetune.sample import CONDITIONS, LEVELS, Split
 
+from .bank_files import LANGUAGES, Language
 from .card_charts import NUM_BARS, draw_conditions, draw_values
 from .card_sheet import Shown, draw_sheet
 from .checks import SPLITS
@@ -34,6 +35,7 @@ _FACETS: dict[str, tuple[str, ...]] = {
     "style": STYLES,
     "level": LEVELS,
     "condition": CONDITIONS,
+    "language": LANGUAGES,
     "source": (),
     "annotator": (),
     "reviewed": ("yes", "no"),
@@ -69,6 +71,7 @@ class Card:
             "style": sample.style,
             "level": sample.level,
             "condition": sample.condition,
+            "language": sample.language,
             "source": proposal.source,
             "annotator": proposal.annotator,
             "reviewed": "yes" if reviewed else "no",
@@ -95,6 +98,12 @@ class Card:
     def splits(self) -> list[Split]:
         """The splits that hold pairs."""
         return [split for split in SPLITS if self.pairs(split)]
+
+    @property
+    def languages(self) -> list[Language]:
+        """The languages of the pairs."""
+        found = {value for facet, value, _ in self._counts if facet == "language"}
+        return [language for language in LANGUAGES if language in found]
 
     def table(self, facet: str) -> str:
         """Pairs by one facet and split, as a Markdown table whose last row is the sum."""
@@ -163,7 +172,7 @@ def _front_matter(card: Card, name: str) -> str:
     files = [{"split": split, "path": f"{split}.parquet"} for split in card.splits]
     matter = {
         "pretty_name": name,
-        "language": ["en"],
+        "language": card.languages,
         "license": "other",
         "license_name": "as-each-source-says",
         "task_categories": ["image-text-to-text", "robotics"],

@@ -30,7 +30,8 @@ from ridetune.stage import Stopwatch, new_folder, run_stage, write_manifest
 
 from .card import Card, write_card
 from .checks import SPLITS, Checker, Fault, Judged, Ledger
-from .formats import SplitFiles, write_dataset_info, write_feedback
+from .feedback import write_feedback
+from .formats import SplitFiles, write_dataset_info
 from .proposals import Proposal, read_proposals
 
 SKIPPED_FILE = "skipped.csv"
@@ -65,7 +66,7 @@ def export(config: DataExportConfig) -> None:
             card = _write(config, codec, ledger, skipped, folder)
         if not card.pairs("train"):
             raise ValueError(_why_empty(config, skipped))
-        write_feedback(folder)
+        write_feedback(card.languages, folder)
         write_dataset_info(folder, config.name, card.splits)
         write_card(card, folder, name=config.name, skipped=skipped.counts)
         save_config(config, folder / CONFIG_FILE)

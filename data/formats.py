@@ -17,14 +17,12 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
-import yaml
 
 from ridetune.codec import MatrixCodec
 from ridetune.prompt import MAX_MEMORIES, SYSTEM, clean_instruction, quote
-from ridetune.sample import FEEDBACK_KINDS, Sample, Split, dataset_features
+from ridetune.sample import Sample, Split, dataset_features
 
 from .checks import SPLITS, picture_digest
-from .instructions import BANK, Bank
 from .proposals import Proposal
 
 IMAGES, JSONL, SHAREGPT, QWEN = "images", "jsonl", "sharegpt", "qwen"
@@ -35,8 +33,6 @@ _GROUP_ROWS, _GROUP_BYTES = 100, 32 * 1024 * 1024
 _DICTIONARY_BYTES = 2 * _GROUP_BYTES
 # What those who read messages would take for a picture of its own.
 _MEDIA = re.compile(r"<(image|video|audio)>", re.IGNORECASE)
-# The C reader is ten times as fast.
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _PNG = b"\x89PNG"
 
 
@@ -142,17 +138,6 @@ def write_dataset_info(folder: Path, name: str, splits: list[Split]) -> None:
 def dataset_name(name: str, split: Split) -> str:
     """The name of a split for LLaMA-Factory, whose lists part at commas."""
     return f"{re.sub(r'[^a-z0-9]+', '_', name.lower()).strip('_') or 'dataset'}_{split}"
-
-
-def write_feedback(folder: Path) -> None:
-    """The feedback sentences by kind as `data.build` writes them, for training and for testing."""
-    # The whole bank takes seconds to load, its feedback alone none.
-    feedback = yaml.load((BANK / "feedback.yaml").read_text(), Loader=_LOADER)
-    bank = Bank(phrases=(), slots={}, grammar={}, feedback=feedback, reasons={})
-    splits: tuple[Split, ...] = ("train", "test")
-    for split in splits:
-        sayings = {kind: bank.feedback_of(kind, split) for kind in FEEDBACK_KINDS}
-        (folder / f"feedback-{split}.json").write_text(json.dumps(sayings, indent=2) + "\n")
 
 
 def _asked(sample: Sample, codec: MatrixCodec) -> str:

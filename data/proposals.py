@@ -8,6 +8,7 @@ A folder of proposals holds parts (part-00000.parquet, ...), each written whole 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -50,14 +51,34 @@ class Proposal:
 
 def write_part(proposals: Iterable[Proposal], path: Path) -> None:
     """Write one part; it appears whole or not at all."""
+    write_whole(part_bytes(proposals), path)
+
+
+def part_bytes(proposals: Iterable[Proposal]) -> bytes:
+    """The content of a part's file."""
     from datasets import Dataset, Features, Value, disable_progress_bars
 
     disable_progress_bars()  # a part takes a moment; the run has a bar of its own
     own = {name: Value("float32" if name == "confidence" else "string") for name in _OWN}
     features = Features({**dataset_features(), **own})
+    content = BytesIO()
+    Dataset.from_list([p.as_row() for p in proposals], features=features).to_parquet(content)
+    return content.getvalue()
+
+
+def write_whole(content: bytes, path: Path) -> None:
+    """Write a file that appears whole or not at all."""
     partial = path.with_suffix(".partial")
-    Dataset.from_list([p.as_row() for p in proposals], features=features).to_parquet(partial)
-    partial.rename(path)
+    try:
+        partial.write_bytes(content)
+        partial.rename(path)
+    finally:
+        partial.unlink(missing_ok=True)  # on a full disk
+
+
+def part_path(folder: Path, number: int) -> Path:
+    """The file of a part."""
+    return folder / f"part-{number:05d}.parquet"
 
 
 def read_proposals(folder: Path) -> Iterator[Proposal]:

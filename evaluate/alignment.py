@@ -48,7 +48,7 @@ def score(
 
 def voice_of(phrase_id: str) -> str:
     """Who wrote a phrase of the bank: `moderate_families/II/...` is of the voice `families`."""
-    return phrase_id.split("/")[0].split("_", 1)[-1]
+    return phrase_id.split("/")[-3].split("_", 1)[-1]
 
 
 def _means(values: Sequence[float], groups: Sequence[str]) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """YAML + overrides -> a frozen dataclass; unknown keys are errors that name the nearest one."""
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from itertools import product
 from pathlib import Path
@@ -13,6 +13,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 Count = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Config = TypeVar("Config")
+CONFIG_FILE = "config.yaml"
 
 
 def load_config(kind: type[Config], path: Path, overrides: Sequence[str] = ()) -> Config:
@@ -45,6 +46,27 @@ def save_config(config: Any, path: Path) -> None:
     """Write the resolved config beside the artefact it made."""
     plain = TypeAdapter(type(config)).dump_python(config, mode="json")
     path.write_text(yaml.safe_dump(plain, sort_keys=False))
+
+
+def start_or_resume(config: Any, folder: Path, *, begun: bool, free: Collection[str] = ()) -> None:
+    """Make a run's folder with its config.yaml, or go on in it.
+
+    begun: whether the folder holds results already; then ValueError where a key differs that is
+    not one of the `free` ones, which do not shape the results.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path, partial = folder / CONFIG_FILE, folder / f".{CONFIG_FILE}"
+    save_config(config, partial)
+    if begun and path.exists():
+        before, now = (yaml.safe_load(file.read_text()) for file in (path, partial))
+        changed = [key for key in now if key not in free and before.get(key) != now[key]]
+        if changed:
+            partial.unlink()
+            raise ValueError(
+                f"{folder} holds results of another {', '.join(changed)}; "
+                "delete it, or name a new `out`"
+            )
+    partial.rename(path)
 
 
 def _override(raw: dict[str, Any], override: str) -> None:

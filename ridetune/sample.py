@@ -46,7 +46,8 @@ class Sample:
     """One image-instruction-action pair with its provenance.
 
     scene_id names the scene without its condition: the five frames of one scene share it.
-    phrase_id names the sentence or template that the instruction comes from.
+    phrase_id names the sentence or template that the instruction comes from; language is its ISO
+    639-1 code.
     """
 
     observation: Observation
@@ -62,6 +63,7 @@ class Sample:
     split: Split
     scene_id: str
     phrase_id: str
+    language: str = "en"
 
     def as_row(self) -> dict[str, Any]:
         """The row of the dataset file; `Sample.of_row` is its inverse."""
@@ -88,6 +90,7 @@ class Sample:
             "split": self.split,
             "scene_id": self.scene_id,
             "phrase_id": self.phrase_id,
+            "language": self.language,
         }
 
     @staticmethod
@@ -101,10 +104,12 @@ class Sample:
             for m in row["memories"]
         )
         kept = {name: row[name] for name in _PLAIN_FIELDS}
+        language = row.get("language") or "en"  # rows of older datasets name none
         return Sample(
             observation=Observation(frame, row.get("speed_mps")),
             memories=memories,
             matrix=ControllerMatrix.of(row["matrix"]),
+            language=language,
             **kept,
         )
 
@@ -138,6 +143,7 @@ def dataset_features() -> Any:
             "memories": [memory],
             "matrix": matrix,
             **dict.fromkeys(_PLAIN_FIELDS, text),
+            "language": text,
         }
     )
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from data.instructions import Bank, load_bank
+from data.phrases import Bank, load_bank
 from ridetune.codec import MatrixCodec
 from ridetune.matrix import Ranges
 

@@ -70,7 +70,7 @@ def exported(pairs: Sequence[Proposal], tmp_path: Path, *overrides: str) -> Path
     write_part(pairs[:5], tmp_path / "proposals/part-00000.parquet")
     write_part(pairs[5:], tmp_path / "proposals/part-00001.parquet")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(data.export, "write_feedback", lambda _: None)
+        patch.setattr(data.export, "write_feedback", lambda *_: None)
         export(export_config(tmp_path, *overrides))
     return tmp_path / "set"
 

@@ -11,6 +11,7 @@ import torch
 from tokenizers import Tokenizer
 
 from data.build import DataConfig, build
+from data.instructions import Speech
 from ridetune.contract import Contract, load_tokenizer
 from ridetune.matrix import Ranges
 from ridetune.prompt import SYSTEM, PromptBuilder
@@ -53,7 +54,7 @@ def small_data() -> Path:
             test_scenes=2,
             instructions_per_frame=3,
             memory_share=0.4,
-            grammar_share=0.3,
+            speech=Speech(("en",), grammar=0.3, own=None, own_share=0.0),
             phrases=24,
             frame_width=224,
             frame_height=128,

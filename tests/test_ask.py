@@ -446,7 +446,7 @@ def test_a_folder_of_another_model_is_left_alone(
     config: AskConfig, proposals: list[Proposal]
 ) -> None:
     ask(config)
-    with pytest.raises(ValueError, match="holds answers of another model, seed"):
+    with pytest.raises(ValueError, match="holds results of another model, seed"):
         ask(replace(config, model="other", seed=8))
     ask(replace(config, max_concurrent=2, max_cost=5.0))
 

@@ -16,7 +16,6 @@ from datasets import Dataset
 import data.build
 from data.annotate import draw_matrix
 from data.build import DataConfig, build
-from data.instructions import Bank
 from ridetune.alignment import conservativeness, style_of
 from ridetune.codec import MatrixCodec
 from ridetune.config import load_config
@@ -36,16 +35,14 @@ TINY = (
 
 
 @pytest.fixture(scope="module")
-def make(root: Path, bank: Bank, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def make(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Builds a tiny dataset with some overrides and returns its folder."""
 
     def run(*overrides: str) -> Path:
         out = tmp_path_factory.mktemp("data") / "set"
         settings = [*TINY, f"ranges={root / 'configs/ranges.yaml'}", *overrides]
         config = load_config(DataConfig, root / "configs/data.yaml", [*settings, f"out={out}"])
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(data.build, "load_bank", lambda: bank)
-            build(config)
+        build(config)
         return out
 
     return run
@@ -204,14 +201,13 @@ def test_remembered_feedback_shifts_the_label_against_the_complaint(
 
 
 def test_a_failed_build_leaves_nothing(
-    root: Path, bank: Bank, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     settings = [*TINY, f"ranges={root / 'configs/ranges.yaml'}", f"out={tmp_path / 'set'}"]
     config = load_config(DataConfig, root / "configs/data.yaml", settings)
-    monkeypatch.setattr(data.build, "load_bank", lambda: bank)
     monkeypatch.setattr(data.build, "write_manifest", full)
     with pytest.raises(OSError, match="No space left"):
         build(config)

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import data.build
 from data.export import export
-from data.instructions import Bank
+from data.feedback import write_feedback
 from data.proposals import Proposal, write_part
 from data.review.store import Store
 from ridetune.codec import MatrixCodec
@@ -140,13 +139,11 @@ def test_the_same_proposals_give_the_same_bytes(pairs: list[Proposal], tmp_path:
     assert {"README.md", "contact_sheet.jpg", "plots/values.svg", "config.yaml"} <= set(first)
 
 
-def test_feedback_is_what_the_build_writes(
-    root: Path, pairs: list[Proposal], bank: Bank, tmp_path: Path
-) -> None:
+def test_feedback_is_what_the_build_writes(pairs: list[Proposal], tmp_path: Path) -> None:
     (tmp_path / "proposals").mkdir()
     write_part(pairs, tmp_path / "proposals/part-00000.parquet")
     export(export_config(tmp_path))
-    data.build._write_feedback(bank, tmp_path)
+    write_feedback(["en"], tmp_path)
     for name in ("feedback-train.json", "feedback-test.json"):
         assert (tmp_path / "set" / name).read_bytes() == (tmp_path / name).read_bytes()
 

@@ -11,8 +11,10 @@ import pytest
 from data import proposals
 from data import propose as stage
 from data.annotate import draw_matrix, shift_for_care
+from data.instructions import Speech
 from data.proposals import Proposal, read_proposals
-from data.propose import ProposeConfig, propose, split_of
+from data.propose import propose
+from data.proposer import ProposeConfig, split_of
 from data.sources.seen import Facts
 from ridetune.camera.render import render
 from ridetune.camera.scene import Scene
@@ -20,6 +22,7 @@ from ridetune.codec import MatrixCodec
 from ridetune.config import load_config
 from ridetune.matrix import STYLES, Ranges, ki_limit
 from ridetune.sample import CONDITIONS, Condition
+from ridetune.workers import Backend
 
 RANGES = Ranges.load(Path("configs/ranges.yaml"))
 
@@ -43,6 +46,10 @@ def frames(tmp_path: Path) -> Path:
         photograph(folder / "sunny" / f"{number}.png", "sunny", 10 + number)
     photograph(folder / "rain" / "wet.png", "rain", 3)
     return folder
+
+
+def parts_of(config: ProposeConfig) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(config.out.glob("part-*"))}
 
 
 def proposals_of(config: ProposeConfig) -> list[Proposal]:
@@ -93,27 +100,68 @@ def test_a_stopped_run_goes_on_and_makes_no_part_twice(
 ) -> None:
     whole = proposals_of(replace(config_of(tmp_path, frames_per_part=2), out=tmp_path / "whole"))
     config = config_of(tmp_path, frames_per_part=2)
-    write = proposals.write_part
+    write = proposals.write_whole
     written: list[int] = []
 
-    def stop_after_one(made: object, path: Path) -> None:
+    def stop_after_one(content: bytes, path: Path) -> None:
         if written:
             raise KeyboardInterrupt
-        write(made, path)  # type: ignore[arg-type]
+        write(content, path)
         written.append(path.stat().st_mtime_ns)
 
-    monkeypatch.setattr(stage, "write_part", stop_after_one)
+    monkeypatch.setattr(stage, "write_whole", stop_after_one)
     with pytest.raises(KeyboardInterrupt):
         propose(config)
-    monkeypatch.setattr(stage, "write_part", write)
+    monkeypatch.setattr(stage, "write_whole", write)
     assert proposals_of(config) == whole
     assert (config.out / "part-00000.parquet").stat().st_mtime_ns == written[0]
 
 
 @pytest.mark.usefixtures("frames")
+@pytest.mark.parametrize("backend", ["joblib", "ray"])
+def test_parts_are_the_same_wherever_they_are_made(tmp_path: Path, backend: Backend) -> None:
+    if backend == "ray":
+        pytest.importorskip("ray", reason="the extra `scale` is not installed")
+    here = config_of(tmp_path, frames_per_part=2)
+    there = replace(here, out=tmp_path / backend, backend=backend, workers=2)
+    propose(here)
+    propose(there)
+    assert len(parts_of(here)) == 3
+    assert parts_of(there) == parts_of(here)
+
+
+@pytest.mark.usefixtures("frames")
+def test_a_run_may_go_on_elsewhere(tmp_path: Path) -> None:
+    config = config_of(tmp_path, frames_per_part=2)
+    propose(config)
+    whole = parts_of(config)
+    (config.out / "part-00001.parquet").unlink()
+    propose(replace(config, backend="joblib", workers=2))
+    assert parts_of(config) == whole
+
+
+@pytest.mark.usefixtures("frames")
+def test_every_language_is_asked_for(tmp_path: Path) -> None:
+    speech = Speech(("de", "zh"), grammar=0.2, own=None, own_share=0.0)
+    made = proposals_of(config_of(tmp_path, speech=speech, test_share=0.0))
+    assert {p.sample.language for p in made} == {"de", "zh"}
+    assert all(p.sample.explanation.startswith("because ") for p in made)
+
+
+@pytest.mark.usefixtures("frames")
+def test_own_commands_are_drawn_beside_the_bank(tmp_path: Path) -> None:
+    csv_file = tmp_path / "mine.csv"
+    rows = [f"Word{n} order{n} now{n},{style},II" for n in range(9) for style in STYLES]
+    csv_file.write_text("text,style,level\n" + "\n".join(rows) + "\n")
+    speech = Speech(("en",), grammar=0.0, own=csv_file, own_share=1.0)
+    made = proposals_of(config_of(tmp_path, speech=speech, test_share=0.0))
+    assert {p.sample.phrase_id.split("/")[0] for p in made} == {"own_mine"}
+
+
+@pytest.mark.usefixtures("frames")
 def test_a_folder_of_another_config_is_refused(tmp_path: Path) -> None:
     propose(config_of(tmp_path))
-    with pytest.raises(ValueError, match="another config"):
+    with pytest.raises(ValueError, match="holds results of another seed"):
         propose(config_of(tmp_path, seed=8))
 
 

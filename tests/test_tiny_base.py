@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from data.build import encode
-from data.instructions import load_bank
+from data.phrases import load_bank
 from ridetune.alignment import conservativeness
 from ridetune.camera.render import render
 from ridetune.camera.scene import sample_scene, with_condition
@@ -75,7 +75,7 @@ def test_bad_conditions_make_the_same_wish_more_conservative(
 
 
 def test_remembered_feedback_moves_the_matrix_against_the_complaint(policy: Policy) -> None:
-    feedback = load_bank().feedback
+    feedback = load_bank().feedback.sayings
     said, scene = (
         "Keep it like this.",
         "sunny straight road in the city, no vehicle ahead, light traffic",

@@ -6,12 +6,10 @@ from typing import get_args
 import numpy as np
 
 from ridetune.camera.scene import Lead
-from ridetune.codec import MatrixCodec
-from ridetune.gate import SafetyGate
 from ridetune.matrix import Ranges
 from ridetune.scene import scene_answers
 
-from ..annotate import draw_matrix, shift_for_care
+from ..annotate import Rules
 from ..proposals import Proposal
 from ..sources.seen import Facts
 from .answers import Answer
@@ -21,19 +19,15 @@ class Labeller:
     """Puts a model's answer in the place of the rules' words, with a matrix that fits it."""
 
     def __init__(self, ranges: Ranges, *, annotator: str, seed: int) -> None:
-        self._codec = MatrixCodec(ranges)
-        self._gate = SafetyGate(ranges, self._codec)
+        self._rules = Rules(ranges)
         self._annotator = annotator
         self._seed = seed
 
     def label(self, proposal: Proposal, answer: Answer) -> Proposal:
         """The proposal as the model has it; the same for the same proposal, answer and seed."""
-        facts = facts_of(answer)
-        care = shift_for_care(facts, proposal.sample.observation.speed_mps)
         rng = np.random.default_rng([self._seed, int(proposal.proposal_id, 16)])
-        matrix = draw_matrix(answer.style, answer.condition, None, self._codec, rng, care=care)
-        verdict = self._gate.judge(matrix, matrix)
-        assert verdict.outcome == "accepted", verdict.reasons
+        speed = proposal.sample.observation.speed_mps
+        matrix = self._rules.label(answer.style, facts_of(answer), speed, rng)
         sample = replace(
             proposal.sample,
             scene=answer.scene,

@@ -1,12 +1,12 @@
 """The run over the parts of a folder: what is there already stays, a stopped run goes on."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import yaml
 from tqdm import tqdm
 
-from ridetune.config import save_config
+from ridetune.config import start_or_resume
 from ridetune.matrix import Ranges
 from ridetune.stage import Stopwatch, write_manifest
 
@@ -17,8 +17,6 @@ from .config import AskConfig
 from .endpoint import LimitReachedError, ModelAnnotator
 from .label import Labeller
 from .skips import Skip, read_skips, write_skips
-
-CONFIG_FILE = "config.yaml"
 
 # The other keys may change between the runs of one folder.
 _SHAPING = ("proposals", "base_url", "model", "prompt", "options", "ranges", "seed")
@@ -31,7 +29,7 @@ def ask(config: AskConfig) -> None:
     ranges = Ranges.load(config.ranges)
     labeller = Labeller(ranges, annotator=f"model:{config.model}", seed=config.seed)
     with ModelAnnotator(config) as annotator:
-        _start_or_resume(config)
+        start_or_resume(config, config.out, begun=True, free=_free(config))
         skips = read_skips(config.out)
         with tqdm(total=num_rows(paths), desc="pairs", unit="pair") as bar:
             for path in paths:
@@ -97,18 +95,5 @@ def _label_part(
     return labelled, cut_off
 
 
-def _start_or_resume(config: AskConfig) -> None:
-    """Make the folder; ValueError where it holds what another config has begun."""
-    config.out.mkdir(parents=True, exist_ok=True)
-    path, partial = config.out / CONFIG_FILE, config.out / f".{CONFIG_FILE}"
-    save_config(config, partial)
-    if path.exists():
-        before, now = (yaml.safe_load(file.read_text()) for file in (path, partial))
-        changed = [key for key in _SHAPING if before.get(key) != now[key]]
-        if changed:
-            partial.unlink()
-            raise ValueError(
-                f"{config.out} holds answers of another {', '.join(changed)}; delete it, or name "
-                "a new `out`"
-            )
-    partial.rename(path)
+def _free(config: AskConfig) -> list[str]:
+    return [key.name for key in fields(config) if key.name not in _SHAPING]

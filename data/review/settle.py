@@ -8,19 +8,14 @@ keeps - neither does until a third annotator has decided.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from pathlib import Path
-
-import yaml
 
 from data.annotate import explain
+from data.phrases import load_reasons
 from data.proposals import Proposal
 from ridetune.matrix import ControllerMatrix, Style
 from ridetune.sample import Sample
 
 from .store import Review
-
-_REASONS = Path(__file__).parents[1] / "bank/reasons.yaml"
 
 
 @dataclass
@@ -102,9 +97,9 @@ def explanation_for(sample: Sample, style: Style) -> str:
     """
     if style == sample.style:
         return sample.explanation
-    reasons = _reasons()
+    reasons = load_reasons()
     if sample.intent not in reasons:
-        raise ValueError(f"{_REASONS} has no reason for the intent {sample.intent!r}; add one")
+        raise ValueError(f"the bank's reasons.yaml lacks the intent {sample.intent!r}; add it")
     return explain(style, reasons[sample.intent][style], sample.condition, None)
 
 
@@ -116,10 +111,3 @@ def _edited(proposal: Proposal, review: Review) -> Proposal:
         explanation=explanation_for(proposal.sample, review.style),
     )
     return replace(proposal, sample=sample)
-
-
-@lru_cache(maxsize=1)
-def _reasons() -> dict[str, dict[Style, str]]:
-    """By intent and style. The whole bank takes seconds to load, this file none."""
-    reasons: dict[str, dict[Style, str]] = yaml.safe_load(_REASONS.read_text())
-    return reasons
