@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from data.review.store import REVIEWS_FILE
-from tests.test_review import write_proposals
+from tests.review_pairs import write_proposals
 
 ROOT = Path(__file__).parents[1]
 CHROMIUM = shutil.which("chromium")
