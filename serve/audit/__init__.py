@@ -1,0 +1,1 @@
+"""What the car was asked, decided and refused, kept so that a change shows."""
