@@ -96,7 +96,7 @@ def test_the_test_split_is_closed(bank: Bank) -> None:
 
 def test_late_sentences_only_train(bank: Bank) -> None:
     late = [p for p in bank.phrases if _voice(p) in LATE_VOICES]
-    assert len(late) > 10_000
+    assert len(late) > 20_000
     assert not any(p.held_out for p in late)
 
 
