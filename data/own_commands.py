@@ -9,6 +9,7 @@ wording alone, as in the bank.
 """
 
 import csv
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from ridetune.prompt import InstructionError, clean_instruction
 from ridetune.sample import LEVELS, Split
 
 from .bank_files import LANGUAGES
-from .held_out import digest, keep_apart, normal, share_of
+from .held_out import digest, keep_apart, share_of
 from .phrases import HELD_OUT_SENTENCES, USUAL_INTENT, Bank, Phrase, check_slots
 
 _NEEDED, _OPTIONAL = ("text", "style", "level"), ("intent", "language")
@@ -44,14 +45,20 @@ class OwnCommands:
 
 
 def read_own_commands(path: Path, bank: Bank) -> OwnCommands:
-    """The commands of a file in the bank's language; ValueError names every wrong row."""
+    """The commands of a file in the bank's language; ValueError names every wrong row.
+
+    Also where the same words are given two styles.
+    """
     distinct: dict[str, Phrase] = {}
     asked = 0
     for phrase in _read_rows(path, bank):
         asked += 1
-        if not bank.repeats_held_out(phrase.text):
-            distinct.setdefault(normal(phrase.text), phrase)
-    phrases = list(distinct.values())
+        first = distinct.setdefault(_said(phrase.text), phrase)
+        if first.style != phrase.style:
+            raise ValueError(
+                f"{path} has {phrase.text!r} twice, as {first.style} and as {phrase.style}; keep one"
+            )
+    phrases = [p for p in distinct.values() if not bank.repeats_held_out(p.text)]
     training = [p.text for p in bank.phrases if not p.held_out]
     held_out = keep_apart(
         [p.text for p in phrases] + training,
@@ -119,6 +126,11 @@ def _phrase_of(row: Mapping[str, str], path: Path, bank: Bank) -> Phrase:
     voice = name if bank.language == "en" else f"{bank.language}/{name}"
     held_out = share_of(text) < HELD_OUT_SENTENCES
     return Phrase(text, style, level, intent, voice, held_out, bank.language)
+
+
+def _said(text: str) -> str:
+    """Words and numbers: 15 metres and 30 metres are two commands, on one side of the split."""
+    return " ".join(re.findall(r"\w+", text.casefold()))
 
 
 def _usual_intent(style: Style, level: str) -> str:

@@ -105,6 +105,19 @@ def test_repeats_and_what_the_bank_holds_out_are_left_out(tmp_path: Path, bank: 
     assert own.repeats == 2
 
 
+def test_one_command_in_two_styles_is_an_error(tmp_path: Path, bank: Bank) -> None:
+    path = written(tmp_path, "Zippy whirr,moderate,I,,", "zippy whirr!,aggressive,II,,")
+    with pytest.raises(ValueError, match=r"'zippy whirr!' twice, as moderate and as aggressive"):
+        read_own_commands(path, bank)
+
+
+def test_commands_that_differ_by_a_number_are_two_on_one_side(tmp_path: Path, bank: Bank) -> None:
+    rows = [f"Zippy whirr {n} bumpety,moderate,I,," for n in range(10, 16)]
+    own = read_own_commands(written(tmp_path, *rows), bank)
+    assert len(own.phrases) == 6
+    assert len({p.held_out for p in own.phrases}) == len({p.phrase_id for p in own.phrases}) == 1
+
+
 def test_a_part_is_held_out_whatever_else_is_in_the_file(tmp_path: Path, bank: Bank) -> None:
     some = read_own_commands(written(tmp_path, *many(100)), bank).phrases
     more = read_own_commands(written(tmp_path, *many(200)), bank).phrases

@@ -151,7 +151,7 @@ def test_every_language_is_asked_for(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("frames")
 def test_own_commands_are_drawn_beside_the_bank(tmp_path: Path) -> None:
     csv_file = tmp_path / "mine.csv"
-    rows = [f"Word{n} order{n} now{n},{style},II" for n in range(9) for style in STYLES]
+    rows = [f"Zo{w}a bu{w}e {style[:4]}{w},{style},II" for w in "bcdfghjkl" for style in STYLES]
     csv_file.write_text("text,style,level\n" + "\n".join(rows) + "\n")
     speech = Speech(("en",), grammar=0.0, own=csv_file, own_share=1.0)
     made = proposals_of(config_of(tmp_path, speech=speech, test_share=0.0))
