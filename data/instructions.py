@@ -107,11 +107,18 @@ def read_own(speech: Speech) -> dict[Language, OwnCommands]:
         found[language] = OwnCommands((), 0)
         if speech.own is not None:
             found[language] = own = read_own_commands(speech.own, load_bank(language))
-            held_out = sum(phrase.held_out for phrase in own.phrases)
-            print(
-                f"{speech.own} [{language}]: {len(own.phrases)} commands, {held_out} of them held "
-                f"out for testing; {own.repeats} left out, said before or held out by the bank"
-            )
+            if own.phrases or own.repeats:
+                held_out = sum(phrase.held_out for phrase in own.phrases)
+                print(
+                    f"{speech.own} [{language}]: {len(own.phrases)} commands, {held_out} of them "
+                    f"held out for testing; {own.repeats} left out, said before or held out by the "
+                    "bank"
+                )
+    if speech.own is not None and not any(own.phrases for own in found.values()):
+        raise ValueError(
+            f"{speech.own} holds no commands in {', '.join(found)}; name their language in "
+            "a column `language`, and in speech.languages"
+        )
     return found
 
 

@@ -56,7 +56,8 @@ def read_own_commands(path: Path, bank: Bank) -> OwnCommands:
         first = distinct.setdefault(_said(phrase.text), phrase)
         if first.style != phrase.style:
             raise ValueError(
-                f"{path} has {phrase.text!r} twice, as {first.style} and as {phrase.style}; keep one"
+                f"{path} has {phrase.text!r} twice, as {first.style} and as {phrase.style}; "
+                "keep one"
             )
     phrases = [p for p in distinct.values() if not bank.repeats_held_out(p.text)]
     training = [p.text for p in bank.phrases if not p.held_out]

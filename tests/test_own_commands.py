@@ -140,6 +140,12 @@ def test_draws_keep_to_the_share_the_style_and_the_side(tmp_path: Path) -> None:
     assert abs(np.mean(own) - 0.25) < 0.04
 
 
+def test_a_file_in_other_languages_is_an_error(tmp_path: Path) -> None:
+    path = written(tmp_path, "Langsamer bitte,conservative,I,,de")
+    with pytest.raises(ValueError, match="holds no commands in en; name their language"):
+        read_own(Speech(("en",), grammar=0.0, own=path, own_share=0.5))
+
+
 def test_no_language_is_an_error() -> None:
     with pytest.raises(ValueError, match="languages is empty"):
         read_own(Speech((), grammar=0.0, own=None, own_share=0.5))
