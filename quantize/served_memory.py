@@ -18,7 +18,8 @@ START_S = 60.0
 def measure_served(bundle: Path, requests: list[tuple[bytes, str]]) -> dict[str, Any]:
     """Start `python -m serve` on a free port, ask it, stop it; peak MB of each of its processes."""
     with tempfile.TemporaryFile("w+") as log:
-        command = [sys.executable, "-m", "serve", f"bundle={bundle.resolve()}", "port=0"]
+        values = [f"bundle={bundle.resolve()}", "port=0", "memory=null", "audit=null"]
+        command = [sys.executable, "-m", "serve", *values]
         server = subprocess.Popen(command, stdout=log, stderr=log)
         try:
             url = _address(server, log)

@@ -11,13 +11,17 @@ import logging
 import signal
 import socket
 import sys
+from contextlib import ExitStack
 from functools import partial
 
 import uvicorn
+from fastapi import FastAPI
 
+from ridetune.memory import PassengerMemory
 from ridetune.stage import run_stage
 
 from .app import ServeConfig, create_app
+from .audit.log import AuditLog
 from .inference import load_served
 from .worker import InferenceWorker
 
@@ -26,17 +30,22 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def serve(config: ServeConfig) -> None:
-    """Serve until SIGTERM or Ctrl-C; ValueError if the bundle or the port cannot be had."""
+    """Serve until SIGTERM or Ctrl-C.
+
+    ValueError if the bundle, the port, the memory or the audit log cannot be had.
+    """
     load = partial(load_served, config.bundle, config.threads, config.vehicle, config.envelope)
     worker = InferenceWorker(load, explanation_s=config.explanation_s)
     try:
         worker.start()
-        with listen(config.host, config.port) as listener:
+        with ExitStack() as opened:
+            listener = opened.enter_context(listen(config.host, config.port))
+            app = _open_app(worker, config, opened)
             host, port = listener.getsockname()[:2]
             _log.info("event=serving url=http://%s:%s bundle=%s", host, port, worker.bundle_id)
             if config.host not in _LOOPBACK:
                 _log.warning("event=open_to_network host=%s: there is no login yet", config.host)
-            _run(worker, config, listener)
+            _run(app, listener)
     finally:
         worker.stop()
 
@@ -53,13 +62,24 @@ def listen(host: str, port: int) -> socket.socket:
         raise ValueError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
 
 
-def _run(worker: InferenceWorker, config: ServeConfig, listener: socket.socket) -> None:
+def _open_app(worker: InferenceWorker, config: ServeConfig, opened: ExitStack) -> FastAPI:
+    """The application on its memory and its audit log, which close with `opened`."""
+    memory = log = None
+    if config.memory is not None:
+        codec, days = worker.contract.codec, config.retention_days
+        memory = opened.enter_context(PassengerMemory(config.memory, codec, retention_days=days))
+    if config.audit is not None:
+        log = opened.enter_context(AuditLog(config.audit, keep_words=config.audit_words))
+    return create_app(worker, config, memory=memory, log=log)
+
+
+def _run(app: FastAPI, listener: socket.socket) -> None:
     # uvicorn raises the signal that stopped it once more; by then it has done its work.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
     server = uvicorn.Server(
         uvicorn.Config(
-            create_app(worker, config),
+            app,
             log_level="warning",
             access_log=False,
             lifespan="on",

@@ -1,21 +1,21 @@
 """The HTTP side: questions in, decisions out, the last safe matrix whenever there is none.
 
-    POST /v1/decide    multipart: frame, instruction, [memories], [session]
+    POST /v1/decide    multipart: frame, instruction, [passenger | memories], [session], [condition]
     GET  /healthz      the process is alive
-    GET  /readyz       200 once the model has answered a frame, else 503
+    GET  /readyz       200 while decisions are possible, else 503 with the reason
 
-Each session keeps the matrix that its car runs; the gate limits the step from there. Requests
-wait their turn for at most half of the deadline, so that the model always has the other half.
+The routes of feedback and passengers are in passengers.py. Every decision, fallback and refusal is
+in the audit log before its answer goes out, every start and stop too; what is older than the
+retention goes at the start and each hour.
 """
 
 import asyncio
 import logging
-import time
-import uuid
-from collections import OrderedDict
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated
 
@@ -24,26 +24,21 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from ridetune.matrix import ControllerMatrix
-from ridetune.prompt import InstructionError, clean_instruction
+from ridetune.memory import RETENTION_DAYS, PassengerMemory
+from ridetune.prompt import InstructionError
 
-from .inference import Job
-from .wire import (
-    DecisionOut,
-    ErrorOut,
-    FallbackOut,
-    Health,
-    Question,
-    Readiness,
-    RequestError,
-    VerdictOut,
-    finite,
-    read_question,
-    rows,
-)
-from .worker import InferenceWorker, InputRejectedError, Reply, WorkerUnavailableError
+from .audit.events import FallbackEvent, RefusalEvent, StartEvent, StopEvent
+from .audit.log import AuditLog
+from .desk import Desk, NoDecisionError
+from .journal import Journal
+from .passengers import passenger_routes
+from .question import read_question
+from .recollection import Recollection
+from .wire import DecisionOut, ErrorOut, FallbackOut, Health, Readiness, RequestError, rows
+from .worker import InferenceWorker, InputRejectedError
 
 _log = logging.getLogger(__name__)
+_HOUR_S = 3600.0
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
@@ -54,7 +49,8 @@ class ServeConfig:
     """How to serve. deadline_s: until the matrix; explanation_s: from there to the explanation.
 
     port 0 takes a free one. queue: requests at once, the next one is sent away. vehicle, envelope:
-    what the gate verifies proposals with.
+    what the gate verifies proposals with. memory, audit: the folders of the passengers' memory and
+    of the audit log, None for none; audit_words: whether the log keeps the passengers' words.
     """
 
     bundle: Path
@@ -67,140 +63,50 @@ class ServeConfig:
     queue: Count
     vehicle: Path = Path("configs/vehicle.yaml")
     envelope: Path = Path("configs/verified.yaml")
+    memory: Path | None = None
+    retention_days: Annotated[float, Field(gt=0, le=36_500)] = RETENTION_DAYS
+    audit: Path | None = None
+    audit_words: bool = False
 
 
-class Sessions:
-    """The last safe matrix of each session; the one unused for longest is dropped for a new one."""
+def create_app(
+    worker: InferenceWorker,
+    config: ServeConfig,
+    *,
+    memory: PassengerMemory | None = None,
+    log: AuditLog | None = None,
+) -> FastAPI:
+    """The application on a started worker; it stops the worker when it shuts down.
 
-    def __init__(self, default: ControllerMatrix, limit: int) -> None:
-        self._default = default
-        self._limit = limit
-        self._matrices: OrderedDict[str, ControllerMatrix] = OrderedDict()
-
-    def last_safe(self, session: str) -> ControllerMatrix:
-        """What the session's car runs; the default at its start."""
-        return self._matrices.get(session, self._default)
-
-    def keep(self, session: str, matrix: ControllerMatrix) -> None:
-        """Remember what the gate let through."""
-        self._matrices[session] = matrix
-        self._matrices.move_to_end(session)
-        if len(self._matrices) > self._limit:
-            self._matrices.popitem(last=False)
-
-
-class NoDecisionError(Exception):
-    """The model gave no answer; the car stays on the session's last safe matrix."""
-
-    def __init__(self, sentence: str, session: str) -> None:
-        super().__init__(sentence)
-        self.session = session
-
-
-class Desk:
-    """Takes questions one at a time to the worker; lives on the event loop."""
-
-    def __init__(self, worker: InferenceWorker, config: ServeConfig) -> None:
-        self.worker = worker
-        self.default = worker.contract.ranges.default
-        self.sessions = Sessions(self.default, config.max_sessions)
-        self._codec = worker.contract.codec
-        self._config = config
-        self._open = 0
-        self._turn = asyncio.Lock()
-
-    @contextmanager
-    def place(self) -> Iterator[None]:
-        """A place in the queue; RequestError 429 if there is none."""
-        if self._open >= self._config.queue:
-            raise RequestError(
-                429, f"{self._open} requests are waiting already, that is the limit; try again"
-            )
-        self._open += 1
-        try:
-            yield
-        finally:
-            self._open -= 1
-
-    async def decide(self, question: Question) -> DecisionOut:
-        """Answer a question; NoDecisionError when the model gives no answer in time."""
-        arrived_s = time.monotonic()
-        self._check(question)
-        session = question.session or uuid.uuid4().hex
-        try:
-            async with asyncio.timeout(self._config.deadline_s / 2):
-                await self._turn.acquire()
-        except TimeoutError as error:
-            raise NoDecisionError("the server is busy with other requests", session) from error
-        try:
-            reply = await self._ask(question, session, arrived_s)
-        finally:
-            self._turn.release()
-        return self._answer(reply, session)
-
-    async def _ask(self, question: Question, session: str, arrived_s: float) -> Reply:
-        job = Job(
-            question.frame,
-            question.instruction,
-            question.memories,
-            self.sessions.last_safe(session),
-            question.condition,
-            arrived_s,
-        )
-        until_s = arrived_s + self._config.deadline_s
-        try:
-            reply = await asyncio.to_thread(self.worker.decide, job, until_s=until_s)
-        except WorkerUnavailableError as error:
-            raise NoDecisionError(str(error), session) from error
-        self.sessions.keep(session, reply.decided.verdict.matrix)
-        return reply
-
-    def _check(self, question: Question) -> None:
-        """What can be told without the model: words, and memories within the envelope."""
-        clean_instruction(question.instruction)
-        for number, memory in enumerate(question.memories):
-            try:
-                self._codec.encode(memory.matrix)
-            except ValueError as error:
-                raise RequestError(422, f"memories.{number}.matrix: {error}") from error
-
-    def _answer(self, reply: Reply, session: str) -> DecisionOut:
-        decided, said = reply.decided, reply.explanation
-        timings = {**decided.timings_ms, **({"explain": said.ms} if said else {})}
-        _log.info(
-            "event=decide outcome=%s total_ms=%.1f frame_age_ms=%.1f",
-            decided.verdict.outcome,
-            timings["total"],
-            decided.frame_age_ms,
-        )
-        return DecisionOut(
-            matrix=rows(decided.verdict.matrix),
-            default=rows(self.default),
-            proposal=rows(decided.proposal),
-            verdict=VerdictOut(
-                outcome=decided.verdict.outcome, reasons=list(decided.verdict.reasons)
-            ),
-            confidence=finite(list(decided.confidence)),
-            scene=said.scene if said else None,
-            explanation=said.explanation if said else None,
-            timings_ms={stage: round(ms, 3) for stage, ms in timings.items()},
-            frame_age_ms=round(decided.frame_age_ms, 3),
-            session=session,
-            bundle=self.worker.bundle_id,
-        )
-
-
-def create_app(worker: InferenceWorker, config: ServeConfig) -> FastAPI:
-    """The application on a started worker; it stops the worker when it shuts down."""
+    memory, log: of the folders that the config names; whoever opened them closes them.
+    """
+    journal = Journal(log)
+    recollection = Recollection(memory, worker.contract.codec, worker.bundle_id)
+    desk = Desk(
+        worker,
+        recollection,
+        journal,
+        deadline_s=config.deadline_s,
+        max_sessions=config.max_sessions,
+        queue=config.queue,
+    )
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        await journal.note(StartEvent(bundle=worker.bundle_id))
+        retiring = asyncio.create_task(
+            _retire(recollection, journal, timedelta(days=config.retention_days))
+        )
         yield
+        retiring.cancel()
+        with suppress(asyncio.CancelledError):
+            await retiring
         worker.stop()
+        await journal.note(StopEvent(reason="the server was told to stop"))
 
     # No /docs page: it would load scripts from outside the car.
     app = FastAPI(title="ridetune", lifespan=lifespan, docs_url=None, redoc_url=None)
-    desk = Desk(worker, config)
+    app.include_router(passenger_routes(recollection))
 
     @app.post("/v1/decide", responses={503: {"model": FallbackOut}, 422: {"model": ErrorOut}})
     async def decide(request: Request) -> DecisionOut:
@@ -213,45 +119,70 @@ def create_app(worker: InferenceWorker, config: ServeConfig) -> FastAPI:
 
     @app.get("/readyz", responses={503: {"model": Readiness}})
     async def readyz() -> JSONResponse:
-        ready = worker.ready
-        reason = None if ready else worker.reason
-        body = Readiness(ready=ready, reason=reason, bundle=worker.bundle_id)
-        return _json(200 if ready else 503, body)
+        reason = journal.fault if worker.ready else worker.reason
+        body = Readiness(ready=reason is None, reason=reason, bundle=worker.bundle_id)
+        return _json(200 if body.ready else 503, body)
 
-    _answer_errors(app, desk)
+    _answer_errors(app, desk, journal)
     return app
 
 
-def _answer_errors(app: FastAPI, desk: Desk) -> None:
-    """Every error is one sentence under the key `error`."""
+async def _retire(recollection: Recollection, journal: Journal, retention: timedelta) -> None:
+    """Remove what is too old, now and every hour."""
+    while True:
+        await recollection.retire()
+        await journal.prune(datetime.now(UTC) - retention)
+        await asyncio.sleep(_HOUR_S)
+
+
+def _answer_errors(app: FastAPI, desk: Desk, journal: Journal) -> None:
+    """Every error is one sentence under the key `error`, and in the audit log."""
+
+    async def send_away(
+        request: Request, status: int, sentence: str, *, quotes: bool = False
+    ) -> JSONResponse:
+        # Not the path itself: it may name a passenger, or be anything at all.
+        route = getattr(request.scope.get("route"), "path", "none of this server")
+        reason = HTTPStatus(status).phrase if quotes else sentence
+        await journal.note(RefusalEvent(session=None, route=route, status=status, reason=reason))
+        return _json(status, ErrorOut(error=sentence))
 
     @app.exception_handler(RequestError)
-    async def refuse(_: Request, error: RequestError) -> JSONResponse:
-        return _json(error.status, ErrorOut(error=str(error)))
+    async def refuse(request: Request, error: RequestError) -> JSONResponse:
+        return await send_away(request, error.status, str(error), quotes=error.quotes)
 
     @app.exception_handler(InputRejectedError)
     @app.exception_handler(InstructionError)
-    async def reject(_: Request, error: ValueError) -> JSONResponse:
-        return _json(422, ErrorOut(error=str(error)))
+    async def reject(request: Request, error: ValueError) -> JSONResponse:
+        return await send_away(request, 422, str(error))
 
     @app.exception_handler(NoDecisionError)
     async def fall_back(_: Request, error: NoDecisionError) -> JSONResponse:
         _log.warning("event=no_decision reason=%r", str(error))
+        matrix = desk.sessions.last_safe(error.session)
+        event = FallbackEvent(
+            **vars(error.asked),
+            bundle=desk.worker.bundle_id,
+            reason=str(error),
+            matrix=matrix.values,
+            expired=False,
+        )
+        await journal.note(event)
         body = FallbackOut(
             error=f"no decision: {error}; the last safe matrix stays",
-            matrix=rows(desk.sessions.last_safe(error.session)),
+            matrix=rows(matrix),
             default=rows(desk.default),
             session=error.session,
         )
         return _json(503, body)
 
     @app.exception_handler(HTTPException)
-    async def other(_: Request, error: HTTPException) -> JSONResponse:
-        return _json(error.status_code, ErrorOut(error=str(error.detail)))
+    async def other(request: Request, error: HTTPException) -> JSONResponse:
+        return await send_away(request, error.status_code, str(error.detail))
 
     @app.exception_handler(Exception)
-    async def fail(_: Request, __: Exception) -> JSONResponse:
-        return _json(500, ErrorOut(error="an internal fault; the server's log says more"))
+    async def fail(request: Request, _: Exception) -> JSONResponse:
+        return await send_away(request, 500, "an internal fault; the server's log says more")
 
 
 def _json(status: int, body: BaseModel) -> JSONResponse:

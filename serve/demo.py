@@ -138,7 +138,8 @@ def running_server(config: DemoConfig) -> Iterator[str]:
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "serve", "--config", str(_SERVE_YAML)]
     limits = [f"deadline_s={ANSWER_S}", f"explanation_s={ANSWER_S}"]
-    values = [f"bundle={config.bundle.resolve()}", f"port={port}", *limits]
+    nothing_kept = ["memory=null", "audit=null"]  # and no lock that another server holds
+    values = [f"bundle={config.bundle.resolve()}", f"port={port}", *limits, *nothing_kept]
     with tempfile.TemporaryFile("w+") as log:
         server = subprocess.Popen([*command, *values], stdout=log, stderr=log)
         try:

@@ -1,41 +1,42 @@
-"""What crosses the wire: the multipart question in, the JSON answers out.
+"""What crosses the wire: the messages of questions, answers, feedback and passengers.
 
-Every size is checked while the body is read, before anything is decoded; unknown fields are
-errors. What is wrong is said in one sentence.
+Unknown fields are errors. What is wrong is said in one sentence.
 """
 
-import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import Request
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
-from starlette.datastructures import FormData, UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
-from starlette.requests import ClientDisconnect
+from pydantic import (
+    AfterValidator,
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+)
 
 from ridetune.gate import Outcome
 from ridetune.matrix import ControllerMatrix
-from ridetune.prompt import MAX_INSTRUCTION_CHARACTERS, MAX_MEMORIES
-from ridetune.sample import CONDITIONS, Condition, Memory
-from ridetune.vision import MAX_BYTES
-
-MAX_BODY_BYTES = MAX_BYTES + 256 * 1024
-MAX_FIELD_BYTES = 64 * 1024
-BODY_S = 10.0
-_FIELDS = ("frame", "instruction", "memories", "session", "condition")
+from ridetune.prompt import MAX_INSTRUCTION_CHARACTERS, MAX_MEMORIES, quote
+from ridetune.sample import Condition, Memory
 
 Rows = list[list[float | None]]
 
 
 class RequestError(ValueError):
-    """A request that cannot be used, with its HTTP status."""
+    """A request that cannot be used, with its HTTP status.
 
-    def __init__(self, status: int, sentence: str) -> None:
+    quotes: whether the sentence shows what the client sent; then the audit log does not keep it.
+    """
+
+    def __init__(self, status: int, sentence: str, *, quotes: bool = False) -> None:
         super().__init__(sentence)
         self.status = status
+        self.quotes = quotes
 
 
 def _flat(matrix: object) -> object:
@@ -46,7 +47,14 @@ def _flat(matrix: object) -> object:
     return matrix
 
 
+def _with_words(text: str) -> str:
+    if not quote(text):
+        raise ValueError("it is empty; say how the drive felt")
+    return text
+
+
 Text = Annotated[str, Field(max_length=MAX_INSTRUCTION_CHARACTERS)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
 Cells = Annotated[
     list[Annotated[float, Field(strict=True, allow_inf_nan=False)]], BeforeValidator(_flat)
 ]
@@ -68,21 +76,21 @@ class MemoryIn(BaseModel):
         return Memory(self.instruction, self.scene, matrix, self.feedback)
 
 
-_MEMORIES = TypeAdapter(Annotated[list[MemoryIn], Field(max_length=MAX_MEMORIES)])
-_CONDITION: TypeAdapter[Condition] = TypeAdapter(Condition)
-_SESSION = TypeAdapter(Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$")])
+MEMORIES = TypeAdapter(Annotated[list[MemoryIn], Field(max_length=MAX_MEMORIES)])
 
 
 @dataclass(frozen=True)
 class Question:
     """A checked request; the frame is not decoded yet. session is empty for a new one.
 
+    passenger: whose memory is recalled; empty for nobody's, and then `memories` may be given.
     condition: what the car's own sensors say of the road; None if they say nothing.
     """
 
     frame: bytes
     instruction: str
     memories: tuple[Memory, ...]
+    passenger: str
     session: str
     condition: Condition | None
 
@@ -98,7 +106,8 @@ class DecisionOut(BaseModel):
     """The answer to a question; matrices are 2x3, times in milliseconds.
 
     `matrix` is what the car may run, `proposal` what the model asked for (null where it gave no
-    finite number). scene and explanation are null where they came too late.
+    finite number). scene and explanation are null where they came too late. `decision` names it for
+    feedback; recalled: the numbers of the remembered drives that went into the prompt.
     """
 
     matrix: Rows
@@ -112,6 +121,8 @@ class DecisionOut(BaseModel):
     frame_age_ms: float
     session: str
     bundle: str
+    decision: str
+    recalled: list[int]
 
 
 class FallbackOut(BaseModel):
@@ -121,6 +132,65 @@ class FallbackOut(BaseModel):
     matrix: Rows
     default: Rows
     session: str
+
+
+class FeedbackIn(BaseModel):
+    """How a decision felt to a passenger, in the passenger's words."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    decision: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+    passenger: Name
+    feedback: Annotated[Text, AfterValidator(_with_words)]
+
+
+class FeedbackOut(BaseModel):
+    """The entry is on the disk under this number; none is written in privacy mode."""
+
+    remembered: bool
+    number: int | None
+
+
+class PrivacyIn(BaseModel):
+    """Privacy mode on or off."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    on: Annotated[bool, Field(strict=True)]
+
+
+class PrivacyOut(BaseModel):
+    """Whether the passenger is in privacy mode now."""
+
+    private: bool
+
+
+class EntryOut(BaseModel):
+    """One remembered drive with its provenance."""
+
+    number: int
+    time: AwareDatetime
+    instruction: str
+    scene: str
+    matrix: Rows
+    feedback: str
+    condition: Condition | None
+    session: str
+    bundle: str
+
+
+class PassengerOut(BaseModel):
+    """All that is kept about a passenger, the newest entry first."""
+
+    count: int
+    private: bool
+    entries: list[EntryOut]
+
+
+class ErasedOut(BaseModel):
+    """How many entries of the passenger were removed without a trace."""
+
+    erased: int
 
 
 class ErrorOut(BaseModel):
@@ -148,122 +218,26 @@ def rows(matrix: ControllerMatrix) -> Rows:
     return [finite(row) for row in matrix.rows]
 
 
-def finite(values: list[float]) -> list[float | None]:
+def finite(values: Sequence[float]) -> list[float | None]:
     """The values with null for what is not finite."""
     return [value if math.isfinite(value) else None for value in values]
 
 
-async def read_question(request: Request) -> Question:
-    """Read and check a multipart request; RequestError if it cannot be used."""
-    form = await _read_form(request)
-    try:
-        for name in form:
-            if name not in _FIELDS:
-                raise RequestError(
-                    422, f"unknown field {name[:40]!r}; the fields are {', '.join(_FIELDS)}"
-                )
-        return Question(
-            frame=await _frame(form),
-            instruction=_text(form, "instruction", required=True),
-            memories=_memories(_text(form, "memories")),
-            session=_session(_text(form, "session")),
-            condition=_condition(_text(form, "condition")),
-        )
-    finally:
-        await form.close()
-
-
-async def _read_form(request: Request) -> FormData:
-    if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
-        raise RequestError(415, "send the frame and the instruction as multipart/form-data")
-    announced = request.headers.get("content-length", "0")
-    if announced.isdecimal() and int(announced) > MAX_BODY_BYTES:
-        raise _too_large()
-    parser = MultiPartParser(
-        request.headers,
-        _bounded(request.stream()),
-        max_files=1,
-        max_fields=8,
-        max_part_size=MAX_FIELD_BYTES,
-    )
-    try:
-        async with asyncio.timeout(BODY_S):
-            return await parser.parse()
-    except TimeoutError as error:
-        raise RequestError(408, f"the request took longer than {BODY_S:.0f} s to arrive") from error
-    except ClientDisconnect as error:
-        raise RequestError(400, "the request ended before it was complete") from error
-    except (MultiPartException, KeyError, UnicodeError, LookupError) as error:
-        detail = getattr(error, "message", "the form cannot be parsed")
-        raise RequestError(422, f"the multipart form is damaged: {detail}") from error
-
-
-async def _bounded(stream: AsyncIterator[bytes]) -> Any:
-    size = 0
-    async for chunk in stream:
-        size += len(chunk)
-        if size > MAX_BODY_BYTES:
-            raise _too_large()
-        yield chunk
-
-
-def _too_large() -> RequestError:
-    return RequestError(
-        413, f"the request is too large, a frame may have {MAX_BYTES} bytes; send a smaller frame"
-    )
-
-
-async def _frame(form: FormData) -> bytes:
-    found = form.getlist("frame")
-    if len(found) != 1 or not isinstance(found[0], UploadFile):
-        raise RequestError(
-            422, "the field 'frame' must hold one file, a JPEG or PNG camera frame; send it"
-        )
-    frame = await found[0].read()
-    if len(frame) > MAX_BYTES:
-        raise _too_large()
-    return frame
-
-
-def _text(form: FormData, name: str, *, required: bool = False) -> str:
-    found = form.getlist(name)
-    if not found and not required:
-        return ""
-    if len(found) != 1 or not isinstance(found[0], str):
-        raise RequestError(422, f"the field {name!r} must be sent once, as text")
-    return found[0]
-
-
-def _memories(text: str) -> tuple[Memory, ...]:
-    try:
-        return tuple(m.memory() for m in _MEMORIES.validate_json(text or "[]"))
-    except ValidationError as error:
-        raise RequestError(422, _sentence("memories", error)) from error
-
-
-def _session(text: str) -> str:
-    if not text:
-        return ""
-    try:
-        return _SESSION.validate_python(text)
-    except ValidationError as error:
-        raise RequestError(
-            422, "session must be 1 to 64 letters, digits, dots, dashes or underscores"
-        ) from error
-
-
-def _condition(text: str) -> Condition | None:
-    if not text:
-        return None
-    try:
-        return _CONDITION.validate_python(text)
-    except ValidationError as error:
-        raise RequestError(
-            422, f"condition must be one of {', '.join(CONDITIONS)}, or left out if not known"
-        ) from error
-
-
-def _sentence(field: str, error: ValidationError) -> str:
+def first_fault(error: ValidationError, *field: str) -> str:
+    """Where and what is wrong, in a few words; it may show names that the client sent."""
     first = error.errors(include_url=False, include_input=False)[0]
-    where = ".".join([field, *(str(part) for part in first["loc"])])
-    return f"{where}: {first['msg'].removeprefix('Value error, ')}"
+    where = ".".join([*field, *(str(part) for part in first["loc"])])
+    return f"{where}: {first['msg'].removeprefix('Value error, ')}".removeprefix(": ")
+
+
+_NAME = TypeAdapter(Name)
+
+
+def check_name(field: str, name: str) -> str:
+    """A passenger's or a session's name; RequestError 422 for anything but plain characters."""
+    try:
+        return _NAME.validate_python(name)
+    except ValidationError as error:
+        raise RequestError(
+            422, f"{field} must be 1 to 64 letters, digits, dots, dashes or underscores"
+        ) from error

@@ -1,10 +1,15 @@
-"""A policy without a model: a word tokenizer and an engine that proposes what it is told to."""
+"""A policy without a model: a word tokenizer and an engine that proposes what it is told to.
+
+python -m tests.fake_policy port=0 memory=some/folder    the real server on this policy
+"""
 
 import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -16,9 +21,13 @@ from ridetune.contract import Contract
 from ridetune.engines import ActionPass, Prefix
 from ridetune.matrix import ControllerMatrix, Ranges
 from ridetune.policy import Policy
-from ridetune.prompt import ACTION_TOKENS, CHAT_TOKENS, QUERY_TOKENS
-from ridetune.vision import VisionSpec
-from serve.inference import Served
+from ridetune.prompt import ACTION_TOKENS, CHAT_TOKENS, QUERY_TOKENS, InstructionError
+from ridetune.stage import run_stage
+from ridetune.vision import FrameError, VisionSpec
+from serve.__main__ import serve
+from serve.app import ServeConfig
+from serve.inference import Decided, Job, Served
+from serve.worker import InputRejectedError, Reply, WorkerUnavailableError
 
 RANGES = Ranges.load(Path(__file__).parents[1] / "configs/ranges.yaml")
 CONTRACT = Contract(VisionSpec(2, 3, 16, 2, 2, (0.5,) * 3, (0.5,) * 3), RANGES)
@@ -102,3 +111,59 @@ def broken() -> Served:
 def dies() -> Served:
     """A process that ends while it loads."""
     os._exit(7)
+
+
+def served_anyway(*config: object) -> Served:
+    """In place of `serve.inference.load_served`."""
+    return served()
+
+
+class WorkerAtHand:
+    """Answers as an `InferenceWorker` does, but in the process of the test, which sees the prompts.
+
+    It has no answer while `reason` is set.
+    """
+
+    contract = CONTRACT
+    bundle_id = "fake"
+
+    def __init__(self) -> None:
+        self.engine = FakeEngine(GOAL, ANSWER)
+        self.reason: str | None = None
+        self._policy = Policy(self.engine, CONTRACT, TOKENIZER)
+
+    @property
+    def ready(self) -> bool:
+        return self.reason is None
+
+    def decide(self, job: Job, *, until_s: float) -> Reply:
+        if self.reason is not None:
+            raise WorkerUnavailableError(self.reason)
+        try:
+            decision = self._policy.decide(
+                job.frame, job.instruction, job.memories, last_safe=job.last_safe
+            )
+        except (FrameError, InstructionError) as error:
+            raise InputRejectedError(str(error)) from error
+        decided = Decided(
+            **{name: getattr(decision, name) for name in Decided.__dataclass_fields__}
+        )
+        return Reply(decided, self._policy.explain(decision))
+
+    def stop(self) -> None:
+        self.reason = "stopped"
+
+    def prompts(self) -> list[str]:
+        """What each decision was asked with: memories and instruction."""
+        ids = self.engine.suffixes
+        return [str(TOKENIZER.decode(suffix, skip_special_tokens=True)) for suffix in ids]
+
+
+def main() -> int:
+    """The server as `python -m serve` runs it."""
+    with patch("serve.__main__.load_served", served_anyway):
+        return run_stage(ServeConfig, "configs/serve.yaml", serve, __doc__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

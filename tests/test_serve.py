@@ -17,8 +17,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from ridetune.config import load_config
-from serve.app import ServeConfig, Sessions, create_app
-from serve.wire import MAX_BODY_BYTES
+from serve.app import ServeConfig, create_app
+from serve.desk import Sessions
+from serve.question import MAX_BODY_BYTES
 from serve.worker import InferenceWorker
 from tests.fake_policy import CONTRACT, GOAL, RANGES, broken, dies, frame, served
 

@@ -56,7 +56,7 @@ def free_port() -> int:
 
 
 def command(bundle: Path, port: int) -> list[str]:
-    values = [f"bundle={bundle}", f"port={port}", "deadline_s=20"]
+    values = [f"bundle={bundle}", f"port={port}", "deadline_s=20", "memory=null", "audit=null"]
     return [sys.executable, "-m", "serve", "--config", "configs/serve.yaml", *values]
 
 
@@ -214,6 +214,8 @@ def test_answer_fits_the_terminal_and_cannot_move_its_cursor() -> None:
         frame_age_ms=13.0,
         session="s",
         bundle="b",
+        decision="d",
+        recalled=[],
     )
     lines = answer_lines("hurry", answer)
     assert all(len(line) <= WIDTH and line.isprintable() for line in lines)
