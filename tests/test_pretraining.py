@@ -38,7 +38,7 @@ from train.rows import read_feedback, read_phrases, read_pixels
 from train.schedule import Steps
 from train.score import query_logits
 from train.teacher import Teacher
-from train.tiny import TinyConfig, keep_words, learn_pictures, pretrain
+from train.tiny import TinyConfig, keep, learn_pictures, pretrain
 from train.words import WordsTask, bins_by_style, drop_words, learn_words, teach, words_only
 
 
@@ -288,5 +288,5 @@ def test_missing_teacher_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -
 def test_the_words_that_are_kept_are_averaged_with_what_came_after() -> None:
     language = torch.nn.Linear(2, 1, bias=False)
     torch.nn.init.constant_(language.weight, 1.0)
-    keep_words(language, {"weight": torch.tensor([[3.0, -1.0]])}, 0.25)
+    keep(language, {"weight": torch.tensor([[3.0, -1.0]])}, 0.25)
     assert language.weight.tolist() == [[1.5, 0.5]]

@@ -71,7 +71,8 @@ class TinyConfig:
     as_text_share: float  # share of samples that answer the paper's way in the last stage
     text_weight: float  # weight of the text loss beside the action loss
     words_in_both: float  # text-only batches in the last stage, as a share of all
-    words_kept: Share  # weight of what stage one left, in the average at the end
+    words_kept: Share  # weight of what stage one left, in the average with the last stage
+    start_kept: Share  # then the weight of the base that the run went on from, if from any
 
 
 def pretrain(config: TinyConfig) -> None:
@@ -108,10 +109,11 @@ def _pretrain(config: TinyConfig) -> None:
     lessons: Lessons = stages.once("lessons", lessons_of)
     task = WordsTask(model, contract, prompts, lessons, config.word_dropout)
     language, visual = model.model.language_model, model.model.visual
+    begun = _copy(language) if config.start is not None else None
 
     def words() -> Any:
         learn_words(task, held_out, config.words, config.seed)
-        return {name: weight.clone() for name, weight in language.state_dict().items()}
+        return _copy(language)
 
     spoken: dict[str, Tensor] = stages.once("words", words)
     language.load_state_dict(spoken)
@@ -125,7 +127,9 @@ def _pretrain(config: TinyConfig) -> None:
     if config.start is None:
         visual.load_state_dict(stages.once("pictures", pictures))
     learn_both(model, contract, prompts, samples, pixels, task, held_out, config)
-    keep_words(language, spoken, config.words_kept)
+    keep(language, spoken, config.words_kept)
+    if begun is not None:
+        keep(language, begun, config.start_kept)
     if not is_first():
         return
 
@@ -232,7 +236,10 @@ def learn_both(
 
     def loss_of(chosen: list[int], rng: np.random.Generator) -> Tensor:
         if rng.random() < config.words_in_both:
-            return task.actions(own_share(next(word_batches)), rng)[0]
+            words = own_share(next(word_batches))
+            if rng.random() < config.words.text_share:
+                return task.text(words, rng)
+            return task.actions(words, rng)[0]
         patches = patches_of(pixels[chosen], contract.vision, augment, rng).to(model.device)
         features = encode_frames(model, patches, contract.vision)
         as_text = rng.random(len(chosen)) < config.as_text_share
@@ -254,15 +261,19 @@ def learn_both(
     train_steps("both", [model], lengths, loss_of, config.both, config.seed, watch=watch)
 
 
-def keep_words(language: nn.Module, spoken: dict[str, Tensor], share: float) -> None:
-    """Average the language model with what stage one left of it; `share` is the latter's weight.
+def keep(language: nn.Module, earlier: dict[str, Tensor], share: float) -> None:
+    """Average the language model with an earlier state of it; `share` is the latter's weight.
 
     Learning to look costs some understanding of words, and the average of both weights keeps most
     of either (WiSE-FT, Wortsman et al. 2022).
     """
     now = language.state_dict()
-    mixed = {name: torch.lerp(now[name], spoken[name].to(now[name]), share) for name in now}
+    mixed = {name: torch.lerp(now[name], earlier[name].to(now[name]), share) for name in now}
     language.load_state_dict(mixed)
+
+
+def _copy(language: nn.Module) -> dict[str, Tensor]:
+    return {name: weight.clone() for name, weight in language.state_dict().items()}
 
 
 def _corpus(phrases: list[Sample]) -> list[str]:

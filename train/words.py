@@ -2,7 +2,7 @@
 
     written and grown sentences   their own labels
     reworded sentences            the teacher's shares of the styles, as a mixture of labels
-    a part of the batches         with text: half the matrix, the paper's way, half the explanation
+    a part of the batches         with text: mostly the matrix, the paper's way, or the explanation
 
 Beside the six bins, throw-away heads on the queries predict the teacher's vector of the sentence
 and what kind of feedback the memories hold.
@@ -32,6 +32,7 @@ from .score import score_phrases
 from .teacher import Teacher
 
 REWORDED = "reworded"
+MATRIX_AS_TEXT = 0.75  # of what is written in the batches with text; the rest is explanations
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class WordsTask:
         """Loss of the matrix as text, or of bins and explanation; opinions are no labels here."""
         rows = [i for i in chosen if not self.lessons.has_opinion[i]] or [0]
         samples = [self.lessons.samples[i] for i in rows]
-        as_text = rng.random(len(samples)) < 0.5
+        as_text = rng.random(len(samples)) < MATRIX_AS_TEXT
         examples = [
             tokenize(sample, self.prompts, image=False, as_text=bool(text))
             for sample, text in zip(samples, as_text, strict=True)
