@@ -153,7 +153,7 @@ def test_the_counts_of_the_card_add_up(pairs: list[Proposal], tmp_path: Path) ->
         r"^\| (\w+) \| train .*\n\|-.*\n((?:\|.*\n?)+)", _card(exported(pairs, tmp_path)), re.M
     )
     assert {name for name, _ in tables} == {
-        *("style", "level", "condition", "source", "annotator", "reviewed", "licence")
+        *("style", "level", "condition", "language", "source", "annotator", "reviewed", "licence")
     }
     for _, rows in tables:
         *parts, whole = ([int(n) for n in re.findall(r" (\d+) ", r)] for r in rows.splitlines())
